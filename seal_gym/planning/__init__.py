@@ -1,0 +1,1 @@
+"""Inverse kinematics. Arrays in, arrays out; knows nothing of MuJoCo or Gymnasium."""

@@ -1,0 +1,101 @@
+"""Closed-form inverse kinematics of the UR5."""
+
+import numpy as np
+
+from seal_gym.core.frames import Array, transform
+from seal_gym.core.kinematics import DH_A, DH_COS_ALPHA, DH_D, DH_SIN_ALPHA, T_TOOL0_TIP
+
+# Branch index = 4 shoulder + 2 wrist + elbow; 0 and 1 choose the sign of each square root.
+BRANCHES = 8
+_SINGULAR = 1e-9
+
+
+def _link(k: int, angle: Array) -> Array:
+    """``T_{k-1,k}`` for joint angles, shape (..., 4, 4)."""
+    c, s = np.cos(angle), np.sin(angle)
+    ca, sa = DH_COS_ALPHA[k], DH_SIN_ALPHA[k]
+    zero = np.zeros_like(c)
+    rotation = np.stack(
+        [
+            np.stack((c, -s * ca, s * sa), -1),
+            np.stack((s, c * ca, -c * sa), -1),
+            np.stack((zero, zero + sa, zero + ca), -1),
+        ],
+        -2,
+    )
+    return transform(rotation, np.stack((DH_A[k] * c, DH_A[k] * s, zero + DH_D[k]), -1))
+
+
+def _inverse(t: Array) -> Array:
+    rotation = np.swapaxes(t[..., :3, :3], -1, -2)
+    return transform(rotation, -(rotation @ t[..., :3, 3:])[..., 0])
+
+
+def _wrap(angle: Array) -> Array:
+    return np.asarray(np.mod(angle + np.pi, 2 * np.pi) - np.pi)
+
+
+def solve(pose_tip: Array, tool: Array = T_TOOL0_TIP) -> Array:
+    """All joint angles that put the tip at a pose.
+
+    Source: K. P. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013),
+    re-derived for the standard DH parameters.
+
+    Args:
+        pose_tip: ``T_base_tip``, shape (..., 4, 4), m.
+        tool: ``T_tool0_tip``, shape (4, 4), m.
+
+    Returns:
+        Shape (..., 8, 6), rad in [-pi, pi): one row a branch, NaN where the branch does not reach the
+        pose. Where the wrist is singular (sin q5 = 0) q6 is 0 by choice.
+    """
+    pose = np.asarray(pose_tip @ _inverse(tool))
+    branch = np.arange(BRANCHES)
+    shoulder, wrist, elbow = (1.0 - 2.0 * ((branch >> bit) & 1) for bit in (2, 1, 0))
+    t06 = np.broadcast_to(pose[..., None, :, :], (*pose.shape[:-2], BRANCHES, 4, 4))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        p05 = t06[..., :3, 3] - DH_D[5] * t06[..., :3, 2]
+        q1 = (
+            np.arctan2(p05[..., 1], p05[..., 0])
+            + shoulder * np.arccos(DH_D[3] / np.hypot(p05[..., 0], p05[..., 1]))
+            + np.pi / 2
+        )
+        s1, c1 = np.sin(q1), np.cos(q1)
+        cos5 = (t06[..., 0, 3] * s1 - t06[..., 1, 3] * c1 - DH_D[3]) / DH_D[5]
+        q5 = wrist * np.arccos(np.where(np.abs(cos5) < 1 + 1e-12, np.clip(cos5, -1.0, 1.0), np.nan))
+        s5 = np.sin(q5)
+        singular = np.abs(s5) < _SINGULAR
+        safe = np.where(singular, 1.0, s5)
+        q6 = np.arctan2(
+            (-t06[..., 0, 1] * s1 + t06[..., 1, 1] * c1) / safe,
+            (t06[..., 0, 0] * s1 - t06[..., 1, 0] * c1) / safe,
+        )
+        q6 = np.where(singular, 0.0, q6)
+        t14 = _inverse(_link(0, q1)) @ t06 @ _inverse(_link(4, q5) @ _link(5, q6))
+        p13 = t14[..., :3, 3] - DH_D[3] * t14[..., :3, 1]
+        reach2 = p13[..., 0] ** 2 + p13[..., 1] ** 2
+        cos3 = (reach2 - DH_A[1] ** 2 - DH_A[2] ** 2) / (2 * DH_A[1] * DH_A[2])
+        q3 = elbow * np.arccos(np.where(np.abs(cos3) < 1 + 1e-12, np.clip(cos3, -1.0, 1.0), np.nan))
+        q2 = np.arctan2(p13[..., 1], p13[..., 0]) - np.arctan2(
+            DH_A[2] * np.sin(q3), DH_A[1] + DH_A[2] * np.cos(q3)
+        )
+        t34 = _inverse(_link(1, q2) @ _link(2, q3)) @ t14
+        q4 = np.arctan2(t34[..., 1, 0], t34[..., 0, 0])
+    q = _wrap(np.stack((q1, q2, q3, q4, q5, q6), axis=-1))
+    return np.where(np.all(np.isfinite(q), axis=-1, keepdims=True), q, np.nan)
+
+
+def nearest(solutions: Array, reference: Array) -> Array:
+    """The solution closest to a posture, each joint unwrapped to within half a turn of it.
+
+    Args:
+        solutions: From ``solve``, shape (..., 8, 6), rad.
+        reference: Posture to stay near, shape (6,), rad.
+
+    Returns:
+        Shape (..., 6), rad; NaN where no branch reaches the pose.
+    """
+    unwrapped = reference + _wrap(solutions - reference)
+    distance = np.sum((unwrapped - reference) ** 2, axis=-1)
+    best = np.argmin(np.where(np.isnan(distance), np.inf, distance), axis=-1)
+    return np.take_along_axis(unwrapped, best[..., None, None], axis=-2)[..., 0, :]
