@@ -1,6 +1,7 @@
 """The cell as a MuJoCo model: pedestal, UR5, gun, sensor cameras and a workpiece, composed with MjSpec."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -27,7 +28,7 @@ _FLOOR_M = -0.80
 _G = mujoco.mjtGeom
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
     """A compiled scene.
 
@@ -226,3 +227,17 @@ def build_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
     except ValueError as error:
         raise PhysicsError(f"workpiece {workpiece.name!r} cannot be simulated: {error}") from error
     return Scene(model=model, workpiece=workpiece, cell=cell, tool=_tool_triangles(model))
+
+
+@lru_cache(maxsize=16)
+def cached_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
+    """``build_scene``, compiled once for each workpiece and cell.
+
+    Args:
+        workpiece: The part.
+        cell: Cameras, timing and limits.
+
+    Returns:
+        The scene; shared, so do not edit its model.
+    """
+    return build_scene(workpiece, cell)

@@ -1,0 +1,1 @@
+"""The sealing task: progress, outcome, metrics and reward, as pure functions of arrays."""

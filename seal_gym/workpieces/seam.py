@@ -43,7 +43,7 @@ class SeamPoint(NamedTuple):
     approach: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Seam:
     """A curve of straight lines and arcs, sampled so finely that segments stand for it.
 

@@ -16,7 +16,7 @@ from seal_gym.workpieces.surface import Surface
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
     """A convex body (or, for ``mesh``, a triangle shell) that gun and arm can hit.
 

@@ -13,7 +13,7 @@ from seal_gym.core.frames import Array, cross
 PLATE, WALL, TABLE = 0, 1, 2
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Material:
     """Look of a face.
 
@@ -35,7 +35,7 @@ MATERIALS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
     """Triangles in the part's frame.
 

@@ -28,7 +28,7 @@ def _plate(lower: tuple[float, float], upper: tuple[float, float]) -> tuple[Surf
     return surface, solids.box((*lower, -PLATE_THICKNESS_M), (*upper, 0.0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Workpiece:
     """A part to be sealed, described in its own frame: the plate's top is the xy plane, z is up.
 

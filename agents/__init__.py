@@ -1,0 +1,1 @@
+"""Policies: the RMP expert, learned policies and their training."""

@@ -1,0 +1,184 @@
+"""Action adapters: what an action means, as joint accelerations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from seal_gym.core.cell import CellCfg, LimitsCfg
+from seal_gym.core.errors import ConfigError
+from seal_gym.core.frames import Array
+from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, TipKinematics
+from seal_gym.rmp import (
+    Leaf,
+    SealingCfg,
+    SeamErrors,
+    cholesky_metric,
+    fixed_policies,
+    joint_limits,
+    on_tip,
+    reference_twist,
+    resolve,
+)
+
+CONTROLS = ("tip", "rmp", "joint")
+# An action entry of 1 is a Cholesky entry of 2, a metric of 4: the expert's weights are at most about 1.
+CHOLESKY_SCALE = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmState:
+    """What a leaf may depend on, of N simulations.
+
+    Attributes:
+        q: Commanded joint angles, shape (N, 6), rad.
+        qd: Commanded joint speeds, shape (N, 6), rad/s.
+        tip: Kinematics of the commanded motion.
+        errors: Where the seam is, by the ROI features.
+        seam_twist: Estimated twist of the seam in the tip frame, shape (N, 6), m/s and rad/s.
+        tip_accel: Tip acceleration commanded a frame ago, shape (N, 6), m/s^2 and rad/s^2.
+        part_pose: ``T_base_part``, shape (N, 4, 4), m: for leaves of the simulation's own (an obstacle's
+            pose, say); policies are not told.
+    """
+
+    q: Array
+    qd: Array
+    tip: TipKinematics
+    errors: SeamErrors
+    seam_twist: Array
+    tip_accel: Array
+    part_pose: Array
+
+
+LeafFunction = Callable[[ArmState], Leaf]
+
+
+class Adapter(Protocol):
+    """Turns actions into joint accelerations."""
+
+    size: int
+
+    def __call__(self, action: Array, state: ArmState) -> Array:
+        """Adapts one frame's actions.
+
+        Args:
+            action: In [-1, 1], shape (N, ``size``).
+            state: Of the arms.
+
+        Returns:
+            Joint accelerations, shape (N, 6), rad/s^2.
+        """
+
+
+def _tip_scale(limits: LimitsCfg) -> Array:
+    return np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
+
+
+class TipAdapter:
+    """Direct control: the tip acceleration (d/dt of the body twist) as given, within the limits."""
+
+    size = 6
+
+    def __init__(self, cell: CellCfg) -> None:
+        """Takes the limits.
+
+        Args:
+            cell: The cell.
+        """
+        self._scale = _tip_scale(cell.limits)
+        self._metric = np.eye(6)[None]
+
+    def __call__(self, action: Array, state: ArmState) -> Array:
+        """See ``Adapter``."""
+        metric = np.broadcast_to(self._metric, (len(action), 6, 6))
+        leaf = on_tip(action * self._scale, metric, state.tip.jacobian, state.tip.drift)
+        return resolve([leaf], state.tip.jacobian)
+
+
+class RmpAdapter:
+    """A policy's (f, A) resolved together with the fixed leaves and the user's.
+
+    Action: 6 entries of f scaled by the tip limits, then the 21 entries of the lower Cholesky factor of A,
+    row by row, times ``CHOLESKY_SCALE``. Fixed leaves: damping against the reference twist, regularisation
+    towards the last tip acceleration, lean, joint limits (see ``seal_gym.rmp``).
+
+    Attributes:
+        leaves: Functions that give one more leaf each; append at any time.
+    """
+
+    size = 27
+
+    def __init__(
+        self, cell: CellCfg, leaves: tuple[LeafFunction, ...] = (), sealing: SealingCfg | None = None
+    ) -> None:
+        """Takes the limits and the leaves.
+
+        Args:
+            cell: The cell.
+            leaves: The user's leaves.
+            sealing: Configuration of the fixed leaves.
+        """
+        self.leaves = list(leaves)
+        self._scale = _tip_scale(cell.limits)
+        self._speed = cell.process.speed_m_s
+        self._sealing = sealing or SealingCfg()
+
+    def __call__(self, action: Array, state: ArmState) -> Array:
+        """See ``Adapter``."""
+        jacobian, drift = state.tip.jacobian, state.tip.drift
+        accel = action[:, :6] * self._scale
+        metric = cholesky_metric(CHOLESKY_SCALE * action[:, 6:])
+        reference = reference_twist(self._speed, state.seam_twist)
+        fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
+        leaves = [on_tip(accel, metric, jacobian, drift)]
+        leaves += [on_tip(*policy, jacobian, drift) for policy in fixed]
+        leaves.append(joint_limits(state.q, state.qd, JOINT_LOWER, JOINT_UPPER))
+        leaves += [leaf(state) for leaf in self.leaves]
+        return resolve(leaves, jacobian)
+
+
+class JointAdapter:
+    """Raw joint accelerations, within the limits."""
+
+    size = 6
+
+    def __init__(self, cell: CellCfg) -> None:
+        """Takes the limit.
+
+        Args:
+            cell: The cell.
+        """
+        self._scale = cell.limits.joint_rad_s2
+
+    def __call__(self, action: Array, state: ArmState) -> Array:
+        """See ``Adapter``."""
+        del state
+        return action * self._scale
+
+
+def make_adapter(control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...]) -> Adapter:
+    """The adapter of a control mode.
+
+    Args:
+        control: ``"tip"``, ``"rmp"`` or ``"joint"``.
+        cell: The cell.
+        leaves: The user's leaves, for ``"rmp"``.
+
+    Returns:
+        The adapter.
+
+    Raises:
+        ConfigError: If there is no such mode, or leaves come with a mode that does not resolve any.
+    """
+    if leaves and control != "rmp":
+        raise ConfigError(
+            f"leaves with control = {control!r}: only control='rmp' resolves leaves; use it or leave them out"
+        )
+    if control == "tip":
+        return TipAdapter(cell)
+    if control == "rmp":
+        return RmpAdapter(cell, leaves)
+    if control == "joint":
+        return JointAdapter(cell)
+    raise ConfigError(f"control = {control!r}: must be one of {list(CONTROLS)}")

@@ -1,0 +1,90 @@
+"""The keyword arguments of every sealing environment, in one place."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+from seal_gym.core.cell import CellCfg, load_cell
+from seal_gym.core.errors import ConfigError, require
+from seal_gym.envs.adapters import CONTROLS, LeafFunction
+from seal_gym.sim.look import LookCfg
+from seal_gym.tasks.progress import SealTaskCfg
+from seal_gym.tasks.reward import RewardCfg
+from seal_gym.workpieces import catalogue
+from seal_gym.workpieces.workpiece import Workpiece
+
+PERCEPTIONS = ("oracle",)
+OBSERVATIONS = ("features", "features+images")
+RENDERERS = ("raycast", "gl")
+
+
+def _one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
+    require(value in allowed, f"{name} = {value!r}: must be one of {list(allowed)}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SealCfg:
+    """How a sealing environment is put together.
+
+    Attributes:
+        workpiece: A name (``flat``, ``cylinder``, ``rectangular``) or a ``Workpiece``.
+        control: ``"tip"`` (6 tip accelerations), ``"rmp"`` (6 f and 21 Cholesky entries of A) or ``"joint"``
+            (6 joint accelerations); all in [-1, 1].
+        perception: ``"oracle"``: the ROI features from the true geometry through the calibrated cameras.
+        observation: ``"features"`` or ``"features+images"``.
+        renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
+        leaves: Extra RMP leaves resolved with the policy's, with ``control="rmp"``.
+        task: Outcomes and displacements.
+        reward: Weights of the reward.
+        look: Ranges of light, exposure, texture, blur and noise of the sensor images.
+        cell: Calibration.
+        threads: Threads for physics and images of a vector of environments.
+    """
+
+    workpiece: str | Workpiece = "flat"
+    control: str = "tip"
+    perception: str = "oracle"
+    observation: str = "features"
+    renderer: str = "raycast"
+    leaves: tuple[LeafFunction, ...] = ()
+    task: SealTaskCfg = field(default_factory=SealTaskCfg)
+    reward: RewardCfg = field(default_factory=RewardCfg)
+    look: LookCfg = field(default_factory=LookCfg)
+    cell: CellCfg = field(default_factory=load_cell)
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Checks the choices."""
+        catalogue.get(self.workpiece)
+        _one_of("control", self.control, CONTROLS)
+        _one_of("perception", self.perception, PERCEPTIONS)
+        _one_of("observation", self.observation, OBSERVATIONS)
+        _one_of("renderer", self.renderer, RENDERERS)
+        require(
+            not self.leaves or self.control == "rmp",
+            f"leaves with control = {self.control!r}: only control='rmp' resolves leaves; use it or leave "
+            "them out",
+        )
+        require(
+            isinstance(self.threads, int) and 1 <= self.threads <= 256,
+            f"threads = {self.threads!r}: must be a whole number in 1..256",
+        )
+        object.__setattr__(self, "leaves", tuple(self.leaves))
+
+    @classmethod
+    def of(cls, **kwargs: Any) -> Self:
+        """Builds the configuration from an environment's keyword arguments.
+
+        Args:
+            **kwargs: The attributes above.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: If a name is unknown or a value out of range.
+        """
+        names = [f.name for f in fields(cls)]
+        unknown = sorted(set(kwargs) - set(names))
+        if unknown:
+            raise ConfigError(f"unknown keyword argument {unknown}: the environment takes {names}")
+        return cls(**kwargs)

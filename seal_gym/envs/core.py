@@ -1,0 +1,418 @@
+"""The one implementation of the sealing environment: N simulations at once. Every face drives this."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from seal_gym.core.errors import ActionError, ConfigError
+from seal_gym.core.frames import Array, axis_angle, tip_rotation, transform, yaw_pose
+from seal_gym.core.kinematics import TipKinematics, tip_kinematics
+from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, make_adapter
+from seal_gym.envs.config import SealCfg
+from seal_gym.envs.sensors import Sensors
+from seal_gym.estimation.seam_rate import SeamRate
+from seal_gym.planning import ik
+from seal_gym.rmp import SeamErrors
+from seal_gym.sim.arm import ArmBatch
+from seal_gym.sim.reach import check_reach
+from seal_gym.sim.scene import Scene, cached_scene
+from seal_gym.tasks.progress import Progress
+from seal_gym.tasks.reward import reward
+from seal_gym.vision.features import RoiFeatures, SeamLines, ViewGeometry, oracle_lines, update_features
+from seal_gym.workpieces import catalogue
+
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
+
+_MM, _DEG = 1e3, float(np.rad2deg(1.0))
+_TWIST = np.array([_MM] * 3 + [_DEG] * 3)
+_SEEN_TWIST = (0, 2, 3, 5)  # what the views can show of the seam's twist: not the motion along y
+# Name, scale from SI, bound after scaling, count: the observation's rows, in order.
+OBSERVATION_ROWS = (
+    ("d_front_mm", _MM, 100.0, 1),
+    ("theta_front_deg", _DEG, 180.0, 1),
+    ("valid_front", 1.0, 1.0, 1),
+    ("d_side_mm", _MM, 100.0, 1),
+    ("theta_side_deg", _DEG, 180.0, 1),
+    ("valid_side", 1.0, 1.0, 1),
+    ("seam_vx_vz_mm_s", _MM, 1e3, 2),
+    ("seam_wx_wz_deg_s", _DEG, 1e3, 2),
+    ("lean_deg", _DEG, 180.0, 1),
+    ("tip_v_mm_s", _MM, 5e3, 3),
+    ("tip_w_deg_s", _DEG, 2e3, 3),
+    ("tip_accel_m_s2", 1.0, 50.0, 3),
+    ("tip_accel_rad_s2", 1.0, 500.0, 3),
+    ("q_rad", 1.0, 10.0, 6),
+    ("qd_rad_s", 1.0, 10.0, 6),
+)
+_BOUND = np.concatenate([np.full(n, bound) for _, _, bound, n in OBSERVATION_ROWS])
+_LOWER = np.where([name.startswith("valid") for name, _, _, n in OBSERVATION_ROWS for _ in range(n)], 0, -_BOUND)
+FEATURES = len(_BOUND)
+_X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+_MAX_DRAWS = 1000
+
+
+class StepResult(NamedTuple):
+    """What a frame brought, for N simulations.
+
+    Attributes:
+        reward: Shape (N,).
+        reached: The seam is sealed, shape (N,).
+        collision: Something was touched, shape (N,).
+        lost: The tip is too far from the path, shape (N,).
+        timeout: None of these within the time limit, shape (N,).
+    """
+
+    reward: Array
+    reached: NDArray[np.bool_]
+    collision: NDArray[np.bool_]
+    lost: NDArray[np.bool_]
+    timeout: NDArray[np.bool_]
+
+    @property
+    def terminated(self) -> NDArray[np.bool_]:
+        """Reached, collision or lost, shape (N,)."""
+        return self.reached | self.collision | self.lost
+
+
+class SealCore:
+    """N sealing cells, stepped together; rows never mix, so N = 1 and N > 1 give the same numbers.
+
+    Attributes:
+        scene: The compiled scene.
+        features: ROI features, brought up to date each frame.
+        tip: Kinematics of the measured motion.
+        progress: Where the tips are along the seam.
+        arm: The physics.
+        lines: The seam's line in each view, as perception found it last.
+        frames: Frames since each simulation's reset, shape (N,).
+    """
+
+    def __init__(self, cfg: SealCfg, n: int) -> None:
+        """Allocates the simulations; ``reset`` every row before the first ``step``.
+
+        Args:
+            cfg: How the environment is put together.
+            n: Number of simulations.
+
+        Raises:
+            SeamError: If this cell cannot seal the workpiece.
+        """
+        cell, task = cfg.cell, cfg.task
+        self.cfg, self.n = cfg, n
+        self.scene: Scene = cached_scene(catalogue.get(cfg.workpiece), cell)
+        self._reach = check_reach(self.scene, task.part_shift_m, task.part_yaw_rad)
+        self._seam = self.scene.workpiece.seam
+        self.arm = ArmBatch(self.scene, n, cfg.threads)
+        self.adapter = make_adapter(cfg.control, cell, cfg.leaves)
+        self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
+        self.sensors = Sensors(self.scene, cfg, n)
+        self._views = ViewGeometry.of(cell)
+        self._rate = SeamRate(n, cell.timing.frame_s)
+        self.features = RoiFeatures.zeros(n)
+        self.lines = SeamLines(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2), np.bool_))
+        self.tip: TipKinematics = tip_kinematics(self.arm.q, self.arm.qd)
+        self._command = self.tip
+        self._tip_accel = np.zeros((n, 6))
+        self._action = np.zeros((n, self.adapter.size))
+        self._lean = np.zeros(n)
+        self.frames = np.zeros(n, np.int64)
+        start = self._seam.at(0.0)
+        self._start = transform(
+            tip_rotation(start.tangent, start.approach),
+            start.position + cell.process.stand_off_m * start.approach,
+        )
+        self._lean_taught = float(np.arctan2(self._start[2, 0], self._start[2, 2]))
+        nominal_s = self._seam.length / cell.process.speed_m_s
+        self.time_limit = int(np.ceil(task.time_factor * nominal_s * cell.timing.frame_rate_hz))
+
+    # -- spaces -----------------------------------------------------------------------------------------
+
+    @property
+    def action_space(self) -> spaces.Box:
+        """Of one environment."""
+        return spaces.Box(-1.0, 1.0, (self.adapter.size,), np.float32)
+
+    @property
+    def observation_space(self) -> spaces.Space[Any]:
+        """Of one environment."""
+        features = spaces.Box(_LOWER.astype(np.float32), _BOUND.astype(np.float32), dtype=np.float32)
+        if self.cfg.observation == "features":
+            return features
+        images = {
+            c.name: spaces.Box(0, 255, (c.height, c.width, 3), np.uint8) for c in self.cfg.cell.cameras
+        }
+        return spaces.Dict({"features": features, **images})
+
+    # -- running ----------------------------------------------------------------------------------------
+
+    def reset(self, i: int, rng: np.random.Generator) -> None:
+        """Starts a new episode in one simulation: displaces the part, puts the gun in its hover.
+
+        Args:
+            i: Which simulation.
+            rng: Draws pose, start and look, always in the same order.
+        """
+        task, part = self.cfg.task, self.scene.workpiece
+        shift = rng.uniform(-task.part_shift_m, task.part_shift_m, 2)
+        yaw = rng.uniform(-task.part_yaw_rad, task.part_yaw_rad)
+        part_pose = part.pose @ yaw_pose(shift[0], shift[1], 0.0, yaw)
+        hovering = self._draw_hover(rng)
+        q = ik.nearest(ik.solve(part_pose @ hovering), self._reach.start_q)
+        self.arm.reset(i, q, part_pose)
+        self.sensors.reset(i, rng)
+        self.progress.reset(i, hovering[:3, 3])
+        self._rate.reset(i)
+        self.features.clear(i)
+        self._tip_accel[i] = 0.0
+        self._action[i] = 0.0
+        self.frames[i] = 0
+
+    def _draw_hover(self, rng: np.random.Generator) -> Array:
+        """``T_part_tip`` of a start from which both ROIs see the seam, drawn until one does."""
+        task, seam = self.cfg.task, self._seam
+        for _ in range(_MAX_DRAWS):
+            hover = rng.uniform(*task.hover_m)
+            sideways = rng.uniform(-task.sideways_m, task.sideways_m)
+            about_z, about_x = rng.uniform(-task.turned_rad, task.turned_rad, 2)
+            turn = axis_angle(_Z, about_z) @ axis_angle(_X, about_x)
+            pose = self._start @ transform(turn, np.array([sideways, 0.0, hover]))
+            seen = seam.at(self.progress.locate(pose[:3, 3])[1])
+            if oracle_lines(seen.position[None], seen.tangent[None], pose[None], self._views).valid.all():
+                return pose
+        raise ConfigError(
+            f"no start in {_MAX_DRAWS} draws has the seam in both ROIs: reduce hover_m = {task.hover_m}, "
+            f"sideways_m = {task.sideways_m} or turned_rad = {task.turned_rad}"
+        )
+
+    def step(self, action: Array) -> StepResult:
+        """Advances all simulations by one frame; call ``observe`` for what they then see.
+
+        Args:
+            action: Shape (N, size); finite, clipped to [-1, 1].
+
+        Returns:
+            Rewards and outcomes.
+
+        Raises:
+            ActionError: If the action has a wrong shape or is not finite.
+        """
+        action = self._checked(action)
+        qdd = self.adapter(action, self._arm_state())
+        touched = self.arm.step(qdd)
+        self._track(qdd)
+        before, error = self.progress.s.copy(), self.progress.error_m.copy()
+        self.progress.advance(self._tip_in_part())
+        self.frames += 1
+        return self._judge(touched, action, before, error)
+
+    def observe(self) -> Observation:
+        """Looks at the seam from where the tips are now.
+
+        Returns:
+            Features of shape (N, FEATURES), or a dict with the images as well; arrays of the caller's own.
+        """
+        self._perceive()
+        features = self._feature_rows()
+        if self.cfg.observation == "features":
+            return features
+        images = self.sensors.images(self.tip.pose, self.arm, self.frames)
+        return {"features": features, "front": images.front, "side": images.side}
+
+    # -- the parts of a step ----------------------------------------------------------------------------
+
+    def _checked(self, action: Array) -> Array:
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.n, self.adapter.size):
+            raise ActionError(
+                f"action has shape {action.shape}: control={self.cfg.control!r} takes "
+                f"{(self.n, self.adapter.size) if self.n > 1 else (self.adapter.size,)}"
+            )
+        if not np.isfinite(action).all():
+            bad = np.argwhere(~np.isfinite(action))[0].tolist()
+            raise ActionError(
+                f"action{bad} = {action[tuple(bad)]}: must be finite; values beyond [-1, 1] are clipped"
+            )
+        return np.minimum(np.maximum(action, -1.0), 1.0)
+
+    def _arm_state(self) -> ArmState:
+        """The commanded motion: integrating along it keeps the servo's lag out of the policy's loop."""
+        self._command = tip_kinematics(self.arm.q_command, self.arm.qd_command)
+        return ArmState(
+            q=self.arm.q_command,
+            qd=self.arm.qd_command,
+            tip=self._command,
+            errors=self.errors,
+            seam_twist=self._rate.twist,
+            tip_accel=self._tip_accel,
+            part_pose=self.arm.part_pose,
+        )
+
+    def _track(self, qdd: Array) -> None:
+        command = self._command
+        self._tip_accel = (command.jacobian @ qdd[:, :, None])[..., 0] + command.drift
+        self.tip = tip_kinematics(self.arm.q, self.arm.qd)
+
+    def _tip_in_part(self) -> Array:
+        part = self.arm.part_pose
+        offset = self.tip.pose[:, :3, 3] - part[:, :3, 3]
+        return np.ascontiguousarray((offset[:, None] @ part[:, :3, :3])[:, 0])
+
+    def _judge(
+        self, touched: NDArray[np.bool_], action: Array, before: Array, error: Array
+    ) -> StepResult:
+        cell, progress = self.cfg.cell, self.progress
+        reached = progress.reached & ~touched
+        lost = progress.lost & ~touched
+        timeout = (self.frames >= self.time_limit) & ~(touched | reached | lost)
+        change = 0.5 * np.abs(action - self._action).mean(axis=1)
+        self._action = action
+        value = reward(
+            (progress.s - before) / (cell.process.speed_m_s * cell.timing.frame_s),
+            progress.error_m,
+            error,
+            np.abs(self.features.theta_rad).max(axis=1),
+            change,
+            reached,
+            touched | lost,
+            self.cfg.reward,
+        )
+        return StepResult(value, reached, touched, lost, timeout)
+
+    def _perceive(self) -> None:
+        seen = self._seam.at(self.progress.s)
+        part = self.arm.part_pose
+        point = (part[:, :3, :3] @ seen.position[:, :, None])[..., 0] + part[:, :3, 3]
+        tangent = (part[:, :3, :3] @ seen.tangent[:, :, None])[..., 0]
+        self.tip = tip_kinematics(self.arm.q, self.arm.qd)
+        self.lines = oracle_lines(point, tangent, self.tip.pose, self._views)
+        update_features(self.features, self.lines, self._views)
+        self._rate.update(
+            self.features.point_m,
+            self.features.direction,
+            self.tip.pose,
+            self.features.valid[:, 0] & self.features.valid[:, 1],
+        )
+        lean = np.arctan2(self.tip.pose[:, 2, 0], self.tip.pose[:, 2, 2]) - self._lean_taught
+        self._lean = np.mod(lean + np.pi, 2 * np.pi) - np.pi
+
+    def _feature_rows(self) -> NDArray[np.float32]:
+        f, rows = self.features, np.empty((self.n, FEATURES))
+        rows[:, 0], rows[:, 3] = _MM * f.d_m[:, 0], _MM * f.d_m[:, 1]
+        rows[:, 1], rows[:, 4] = _DEG * f.theta_rad[:, 0], _DEG * f.theta_rad[:, 1]
+        rows[:, 2], rows[:, 5] = f.valid[:, 0], f.valid[:, 1]
+        rows[:, 6:10] = (_TWIST * self._rate.twist)[:, _SEEN_TWIST]
+        rows[:, 10] = _DEG * self._lean
+        rows[:, 11:17] = _TWIST * self.tip.twist
+        rows[:, 17:23] = self._tip_accel
+        rows[:, 23:29] = self.arm.q
+        rows[:, 29:35] = self.arm.qd
+        return np.minimum(np.maximum(rows, _LOWER), _BOUND).astype(np.float32)
+
+    # -- what others may ask ----------------------------------------------------------------------------
+
+    @property
+    def errors(self) -> SeamErrors:
+        """Where the seam is in the tip frame, by the ROI features; each of shape (N,)."""
+        f = self.features
+        return SeamErrors(f.d_m[:, 0], f.theta_rad[:, 0], f.d_m[:, 1], f.theta_rad[:, 1], self._lean)
+
+    @property
+    def seam_twist(self) -> Array:
+        """Estimated twist of the seam in the tip frame, shape (N, 6), m/s and rad/s."""
+        return self._rate.twist
+
+    def add_leaf(self, leaf: LeafFunction) -> None:
+        """Adds an RMP leaf at run time.
+
+        Args:
+            leaf: Gives a ``Leaf`` from an ``ArmState``.
+
+        Raises:
+            ActionError: If the control mode resolves no leaves.
+        """
+        if not isinstance(self.adapter, RmpAdapter):
+            raise ActionError(f"control = {self.cfg.control!r} resolves no leaves: use control='rmp'")
+        self.adapter.leaves.append(leaf)
+
+    def seconds(self, i: int) -> float:
+        """Simulated time of one episode.
+
+        Args:
+            i: Which simulation.
+
+        Returns:
+            Seconds since its reset.
+        """
+        return float(self.frames[i] * self.cfg.cell.timing.frame_s)
+
+    def episode_metrics(self, i: int, result: StepResult) -> dict[str, Any]:
+        """Summary of an episode that has ended.
+
+        Args:
+            i: Which simulation.
+            result: Of its last step.
+
+        Returns:
+            Outcome and metrics as protocol.md names them.
+        """
+        names = ("collision", "reached", "lost", "timeout")
+        outcome = next((name for name in names if getattr(result, name)[i]), "running")
+        return {
+            "outcome": outcome,
+            "reached": outcome == "reached",
+            "collision": outcome == "collision",
+            "timeout": outcome in ("timeout", "lost"),
+            **self.progress.metrics(i),
+            "time_s": self.seconds(i),
+        }
+
+    def info(self, i: int, result: StepResult | None) -> dict[str, Any]:
+        """The info dictionary of one simulation.
+
+        Args:
+            i: Which simulation.
+            result: Of its last step, or None after a reset.
+
+        Returns:
+            See ``SealEnv``.
+        """
+        f = self.features
+        collision, reached = (False, False) if result is None else (bool(result.collision[i]), bool(result.reached[i]))
+        info: dict[str, Any] = {
+            "tip_error_mm": float(_MM * self.progress.error_m[i]),
+            "progress": float(self.progress.share[i]),
+            "collision": collision,
+            "reached": reached,
+            "is_success": reached,
+            "renderer": self.cfg.renderer,
+            "seam_velocity": self._rate.twist[i].copy(),
+            "roi": roi_info(f, i),
+        }
+        if self.sensors.snr_db is not None:
+            info["snr_db"] = self.sensors.snr_db[i].copy()
+        if result is not None and (result.terminated[i] or result.timeout[i]):
+            info["episode_metrics"] = self.episode_metrics(i, result)
+        return info
+
+
+def roi_info(f: RoiFeatures, i: int) -> dict[str, float | bool]:
+    """The ROI features of one simulation by name.
+
+    Args:
+        f: Features of N simulations.
+        i: Which one.
+
+    Returns:
+        For ``front`` and ``side``: ``d_<view>_mm``, ``theta_<view>_rad``, ``d_<view>_px``,
+        ``theta_<view>_px_rad`` and ``valid_<view>``.
+    """
+    out: dict[str, float | bool] = {}
+    for v, view in enumerate(("front", "side")):
+        out[f"d_{view}_mm"] = float(_MM * f.d_m[i, v])
+        out[f"theta_{view}_rad"] = float(f.theta_rad[i, v])
+        out[f"d_{view}_px"] = float(f.d_px[i, v])
+        out[f"theta_{view}_px_rad"] = float(f.theta_px_rad[i, v])
+        out[f"valid_{view}"] = bool(f.valid[i, v])
+    return out

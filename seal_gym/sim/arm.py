@@ -1,0 +1,138 @@
+"""N arms over N parts, stepped together: joint accelerations in, joint states and contacts out."""
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+from numpy.typing import NDArray
+
+from seal_gym.core.errors import PhysicsError
+from seal_gym.core.frames import Array, quat_from_matrix
+from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_UPPER
+from seal_gym.sim.scene import Scene
+
+
+class ArmBatch:
+    """The physics of N cells of one scene.
+
+    A commanded joint trajectory is integrated from the accelerations within the UR5's speed and position
+    limits; gravity-compensated position servos (``assets/ur5_sealgun/ur5.xml``) follow it within the real
+    torque limits. The servo's target leads the trajectory by (kv / kp) qd, which cancels the lag of its
+    damping.
+
+    Attributes:
+        q: Joint angles, shape (N, 6), rad; a live view of the simulation.
+        qd: Joint speeds, shape (N, 6), rad/s; a live view of the simulation.
+        q_command: Commanded joint angles, shape (N, 6), rad.
+        qd_command: Commanded joint speeds, shape (N, 6), rad/s.
+        part_pose: ``T_base_part``, shape (N, 4, 4), m.
+    """
+
+    def __init__(self, scene: Scene, n: int, threads: int = 0) -> None:
+        """Allocates N simulations.
+
+        Args:
+            scene: The compiled scene.
+            n: Number of simulations, >= 1.
+            threads: Threads to step them on, the caller's included; 0 and 1 mean the caller's alone.
+        """
+        model = scene.model
+        self.scene = scene
+        self.n = n
+        self._batch = Batch(model, n, nthread=max(threads, 0))
+        self.q: Array = self._batch.bind("qpos")
+        self.qd: Array = self._batch.bind("qvel")
+        self._mocap_pos: Array = self._batch.bind("mocap_pos")
+        self._mocap_quat: Array = self._batch.bind("mocap_quat")
+        self.q_command = np.zeros((n, 6))
+        self.qd_command = np.zeros((n, 6))
+        self.part_pose = np.tile(np.eye(4), (n, 1, 1))
+        steps = scene.cell.timing.substeps
+        self._dt = scene.cell.timing.frame_s
+        # Times at the ends of the substeps, and what they make of speed and acceleration.
+        self._t = (np.arange(1, steps + 1) * scene.cell.timing.step_s)[None, :, None]
+        kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+        self._lead = kv / kp
+        self._contact = {"ncon": np.zeros((n, steps), np.int32)}
+
+    def reset(self, i: int, q: Array, part_pose: Array) -> None:
+        """Puts one simulation at rest.
+
+        Args:
+            i: Which simulation.
+            q: Joint angles, shape (6,), rad.
+            part_pose: ``T_base_part``, shape (4, 4), m.
+        """
+        self._batch.reset([i], stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+        self.q[i] = self.q_command[i] = q
+        self.qd[i] = self.qd_command[i] = 0.0
+        self.place_part(i, part_pose)
+
+    def place_part(self, i: int, part_pose: Array) -> None:
+        """Moves the part of one simulation.
+
+        Args:
+            i: Which simulation.
+            part_pose: ``T_base_part``, shape (4, 4), m.
+        """
+        self.part_pose[i] = part_pose
+        self._mocap_pos[i, 0] = part_pose[:3, 3]
+        self._mocap_quat[i, 0] = quat_from_matrix(part_pose[:3, :3])
+
+    def step(self, qdd: Array) -> NDArray[np.bool_]:
+        """Advances all simulations by one frame.
+
+        Args:
+            qdd: Commanded joint accelerations, shape (N, 6), rad/s^2.
+
+        Returns:
+            Whether anything touched anything during the frame, shape (N,).
+
+        Raises:
+            PhysicsError: If MuJoCo reports an error.
+        """
+        dt = self._dt
+        speed = np.clip(self.qd_command + qdd * dt, -JOINT_SPEED, JOINT_SPEED)
+        reached = self.q_command + 0.5 * (self.qd_command + speed) * dt
+        stopped = (reached < JOINT_LOWER) | (reached > JOINT_UPPER)
+        if stopped.any():
+            reached = np.clip(reached, JOINT_LOWER, JOINT_UPPER)
+            speed = np.where(stopped, 0.0, speed)
+        acceleration = (speed - self.qd_command) / dt
+        start, rate = self.q_command[:, None], self.qd_command[:, None]
+        t, a = self._t, acceleration[:, None]
+        target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + t * a)
+        try:
+            touched = self._batch.rollout(
+                target.shape[1], target, record=("ncon",), out=self._contact
+            )["ncon"]
+        except SimulationError as error:
+            raise PhysicsError(f"MuJoCo stopped simulations {error.ids.tolist()}: {error}") from error
+        self.q_command, self.qd_command = reached, speed
+        return np.asarray(touched.any(axis=1))
+
+    def data(self, i: int) -> mujoco.MjData:
+        """One simulation's state as an ``MjData``, to render it or to look into it.
+
+        Args:
+            i: Which simulation.
+
+        Returns:
+            A copy with positions, contacts and cameras up to date.
+        """
+        data = self._batch.get_data(i)
+        mujoco.mj_forward(self.scene.model, data)
+        return data
+
+    def contacts(self, i: int) -> list[tuple[str, str]]:
+        """Names of the geoms that touch in one simulation now.
+
+        Args:
+            i: Which simulation.
+
+        Returns:
+            Pairs of geom names.
+        """
+        model = self.scene.model
+        return [
+            (model.geom(int(c.geom1)).name, model.geom(int(c.geom2)).name) for c in self.data(i).contact
+        ]
