@@ -17,6 +17,21 @@ OBSERVATIONS = ("features", "features+images")
 RENDERERS = ("raycast", "gl")
 
 
+def check_num_envs(num_envs: object) -> None:
+    """Refuses a number of simulations that cannot be.
+
+    Args:
+        num_envs: Number of simulations.
+
+    Raises:
+        ConfigError: If it is not a whole number > 0.
+    """
+    require(
+        isinstance(num_envs, int) and num_envs >= 1,
+        f"num_envs = {num_envs!r}: must be a whole number >= 1",
+    )
+
+
 def _one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
     require(value in allowed, f"{name} = {value!r}: must be one of {list(allowed)}")
 

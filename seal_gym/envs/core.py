@@ -207,13 +207,17 @@ class SealCore:
         self.frames += 1
         return self._judge(touched, action, before, error)
 
-    def observe(self) -> Observation:
+    def observe(self, rows: NDArray[np.bool_] | None = None) -> Observation:
         """Looks at the seam from where the tips are now.
+
+        Args:
+            rows: Simulations that look, shape (N,), all by default. The others have looked in this frame
+                already: their estimates stay as they are.
 
         Returns:
             Features of shape (N, FEATURES), or a dict with the images as well; arrays of the caller's own.
         """
-        self._perceive()
+        self._perceive(rows)
         features = self._feature_rows()
         if self.cfg.observation == "features":
             return features
@@ -280,7 +284,7 @@ class SealCore:
         )
         return StepResult(value, reached, touched, lost, timeout)
 
-    def _perceive(self) -> None:
+    def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
         seen = self._seam.at(self.progress.s)
         part = self.arm.part_pose
         point = (part[:, :3, :3] @ seen.position[:, :, None])[..., 0] + part[:, :3, 3]
@@ -293,6 +297,7 @@ class SealCore:
             self.features.direction,
             self.tip.pose,
             self.features.valid[:, 0] & self.features.valid[:, 1],
+            rows,
         )
         lean = np.arctan2(self.tip.pose[:, 2, 0], self.tip.pose[:, 2, 2]) - self._lean_taught
         self._lean = np.mod(lean + np.pi, 2 * np.pi) - np.pi
@@ -322,6 +327,11 @@ class SealCore:
     def seam_twist(self) -> Array:
         """Estimated twist of the seam in the tip frame, shape (N, 6), m/s and rad/s."""
         return self._rate.twist
+
+    @property
+    def snr_db(self) -> Array | None:
+        """Signal-to-noise ratio of the observed images, shape (N, 2), dB; None without images."""
+        return None if self.cfg.observation == "features" else self.sensors.snr_db
 
     def add_leaf(self, leaf: LeafFunction) -> None:
         """Adds an RMP leaf at run time.
@@ -390,8 +400,8 @@ class SealCore:
             "seam_velocity": self._rate.twist[i].copy(),
             "roi": roi_info(f, i),
         }
-        if self.sensors.snr_db is not None:
-            info["snr_db"] = self.sensors.snr_db[i].copy()
+        if self.snr_db is not None:
+            info["snr_db"] = self.snr_db[i].copy()
         if result is not None and (result.terminated[i] or result.timeout[i]):
             info["episode_metrics"] = self.episode_metrics(i, result)
         return info

@@ -1,5 +1,6 @@
 """What people look at: a third-person picture with the ROIs as insets, or MuJoCo's viewer."""
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -8,17 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seal_gym.core.errors import RenderError, require
+from seal_gym.core.frames import Array, normalise
 from seal_gym.sim.scene import GROUP_COLLISION
 
 if TYPE_CHECKING:
     from seal_gym.envs.core import SealCore
 
 HEIGHT, WIDTH = 720, 960
+_PANEL = 304
 _ZOOM = 3
-_MARGIN = 14
-_FRAME_RGB = (245, 245, 245)
+_BACK_RGB = (28, 30, 34)
+_TEXT_RGB = (235, 235, 235)
 _LINE_RGB = (64, 220, 90)
 _TIP_RGB = (255, 70, 60)
+_TRAIL_RGBA = np.array([1.0, 0.45, 0.10, 1.0], np.float32)
+_TRAIL_STEP_M = 2e-3
+_TRAIL_RADIUS_M = 8e-4
+# Viewing direction of the close-up in the tip frame.
+_CLOSE_VIEW = normalise(np.array([-0.75, -0.60, -0.45]))
 
 
 def check_render_mode(render_mode: str | None, allowed: list[str]) -> None:
@@ -70,12 +78,16 @@ class SceneView:
             core: What to show.
         """
         self._core = core
-        self._renderer: mujoco.Renderer | None = None
+        self._renderers: dict[str, mujoco.Renderer] = {}
+        self._trail: list[Array] = []
+        self._frame = 0
         self._viewer: Any = None
         self._viewer_data: mujoco.MjData | None = None
 
     def picture(self) -> NDArray[np.uint8]:
-        """The cell from the side of the bench, the ROIs in the upper right corner.
+        """The cell from the free side of the bench; beside it a close-up of the nozzle and the two ROIs.
+
+        The orange trail is the way of the nozzle mouth on the part.
 
         Returns:
             Shape (720, 960, 3), RGB.
@@ -83,46 +95,84 @@ class SceneView:
         Raises:
             RenderError: If no OpenGL context can be made here.
         """
-        from seal_gym.sim.gl import offscreen  # noqa: PLC0415  # loads OpenGL: only for pictures
-
-        core = self._core
-        if self._renderer is None:
-            self._renderer = offscreen(core.scene.model, HEIGHT, WIDTH)
-        option = mujoco.MjvOption()
-        option.geomgroup[GROUP_COLLISION] = 0
-        option.sitegroup[:] = 0
-        self._renderer.update_scene(core.arm.data(0), camera=self._camera(), scene_option=option)
-        picture = self._renderer.render().copy()
-        self._add_insets(picture)
-        return picture
-
-    def _camera(self) -> mujoco.MjvCamera:
-        """Looks at the middle between the part and the gun, from the free side."""
-        camera = mujoco.MjvCamera()
-        part = self._core.arm.part_pose[0, :3, 3]
-        camera.lookat[:] = 0.5 * (part + self._core.tip.pose[0, :3, 3]) + [-0.06, 0.0, 0.10]
-        camera.distance, camera.azimuth, camera.elevation = 0.95, 150.0, -28.0
-        return camera
-
-    def _add_insets(self, picture: NDArray[np.uint8]) -> None:
+        self._extend_trail()
+        out = np.full((HEIGHT, WIDTH, 3), _BACK_RGB, np.uint8)
+        out[:, : WIDTH - _PANEL] = self._shot("wide", HEIGHT, WIDTH - _PANEL, self._wide())
         core = self._core
         images = core.sensors.images(core.tip.pose, core.arm, core.frames)
-        top = _MARGIN
+        top = 0
         for v, (camera, image) in enumerate(zip(core.cfg.cell.cameras, images[:2], strict=True)):
             seen = bool(core.features.valid[0, v])
             line = core.lines
             inset = roi_inset(
                 image[0], line.point[0, v] if seen else None, line.direction[0, v], camera.tip_px
             )
-            height, width = inset.shape[:2]
-            left = WIDTH - _MARGIN - width
-            cv2.rectangle(picture, (left - 2, top - 2), (left + width + 1, top + height + 1), _FRAME_RGB, 2)
-            picture[top : top + height, left : left + width] = inset
-            cv2.putText(
-                picture, camera.name, (left, top + height + 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55,
-                _FRAME_RGB, 1, cv2.LINE_AA,
-            )
-            top += height + 36
+            top = self._place(out, inset, top, f"{camera.name} view")
+        height = HEIGHT - top - 30
+        self._place(out, self._shot("close", height, _PANEL - 4, self._close()), top, "nozzle")
+        return out
+
+    @staticmethod
+    def _place(out: NDArray[np.uint8], inset: NDArray[np.uint8], top: int, label: str) -> int:
+        """Puts an inset and its label into the panel; returns where the next one goes."""
+        height, width = inset.shape[:2]
+        left = WIDTH - _PANEL + (_PANEL - width) // 2
+        where = (left, top + 20)
+        cv2.putText(out, label, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
+        out[top + 28 : top + 28 + height, left : left + width] = inset
+        return top + 28 + height
+
+    def _shot(self, name: str, height: int, width: int, camera: mujoco.MjvCamera) -> NDArray[np.uint8]:
+        from seal_gym.sim.gl import offscreen  # noqa: PLC0415  # loads OpenGL: only for pictures
+
+        if name not in self._renderers:
+            self._renderers[name] = offscreen(self._core.scene.model, height, width)
+        renderer = self._renderers[name]
+        option = mujoco.MjvOption()
+        option.geomgroup[GROUP_COLLISION] = 0
+        option.sitegroup[:] = 0
+        renderer.update_scene(self._core.arm.data(0), camera=camera, scene_option=option)
+        self._draw_trail(renderer.scene)
+        return np.asarray(renderer.render())
+
+    def _wide(self) -> mujoco.MjvCamera:
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = self._core.arm.part_pose[0, :3, 3] + [-0.10, 0.0, 0.12]
+        camera.distance, camera.azimuth, camera.elevation = 1.0, 205.0, -38.0
+        return camera
+
+    def _close(self) -> mujoco.MjvCamera:
+        """From ahead of the nozzle on its free side, whichever way the gun has turned."""
+        pose = self._core.tip.pose[0]
+        view = pose[:3, :3] @ _CLOSE_VIEW
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = pose[:3, 3] + 0.006 * pose[:3, 2]
+        camera.distance = 0.13
+        camera.azimuth = float(np.rad2deg(np.arctan2(view[1], view[0])))
+        camera.elevation = float(np.rad2deg(np.arcsin(np.clip(view[2], -1.0, 1.0))))
+        return camera
+
+    def _extend_trail(self) -> None:
+        core = self._core
+        if core.frames[0] < self._frame:
+            self._trail.clear()
+        self._frame = int(core.frames[0])
+        part = core.arm.part_pose[0]
+        mouth = part[:3, :3].T @ (core.tip.pose[0, :3, 3] - part[:3, 3])
+        if not self._trail or np.linalg.norm(mouth - self._trail[-1]) >= _TRAIL_STEP_M:
+            self._trail.append(mouth)
+
+    def _draw_trail(self, scene: mujoco.MjvScene) -> None:
+        part = self._core.arm.part_pose[0]
+        points = [part[:3, :3] @ p + part[:3, 3] for p in self._trail]
+        for a, b in pairwise(points):
+            if scene.ngeom >= scene.maxgeom:
+                return
+            geom = scene.geoms[scene.ngeom]
+            capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+            mujoco.mjv_initGeom(geom, int(capsule), np.zeros(3), np.zeros(3), np.eye(3).ravel(), _TRAIL_RGBA)
+            mujoco.mjv_connector(geom, int(capsule), _TRAIL_RADIUS_M, a, b)
+            scene.ngeom += 1
 
     def sync(self) -> None:
         """Brings MuJoCo's viewer up to date, opening it first.
@@ -150,9 +200,9 @@ class SceneView:
 
     def close(self) -> None:
         """Closes what was opened; safe to call twice."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None

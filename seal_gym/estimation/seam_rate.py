@@ -41,7 +41,14 @@ class SeamRate:
         self.twist[i] = 0.0
         self._seen[i] = False
 
-    def update(self, point: Array, direction: Array, tip_pose: Array, valid: NDArray[np.bool_]) -> None:
+    def update(
+        self,
+        point: Array,
+        direction: Array,
+        tip_pose: Array,
+        valid: NDArray[np.bool_],
+        rows: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Takes the lines of a new frame.
 
         Args:
@@ -49,6 +56,7 @@ class SeamRate:
             direction: Its unit direction in the tip frame, shape (N, 3).
             tip_pose: ``T_world_tip``, shape (N, 4, 4), m.
             valid: Whether the line was seen, shape (N,).
+            rows: Simulations that have a new frame, shape (N,), all by default.
         """
         rotation = tip_pose[:, :3, :3]
         p = (rotation @ point[:, :, None])[..., 0] + tip_pose[:, :3, 3]
@@ -62,5 +70,9 @@ class SeamRate:
         raw = (world @ rotation).reshape(-1, 6)
         raw[:, 1] = raw[:, 4] = 0.0
         gain = np.where(valid, self._gain * self._seen, self._gain)[:, None]
+        if rows is not None:
+            gain = gain * rows[:, None]
+            p, d = np.where(rows[:, None], p, self._point), np.where(rows[:, None], d, self._direction)
+            valid = np.where(rows, valid, self._seen)
         self.twist += gain * (np.where((valid & self._seen)[:, None], raw, 0.0) - self.twist)
         self._point, self._direction, self._seen = p, d, valid.copy()

@@ -47,7 +47,8 @@ def solve(pose_tip: Array, tool: Array = T_TOOL0_TIP) -> Array:
 
     Returns:
         Shape (..., 8, 6), rad in [-pi, pi): one row a branch, NaN where the branch does not reach the
-        pose. Where the wrist is singular (sin q5 = 0) q6 is 0 by choice.
+        pose. Where the wrist is singular (sin q5 = 0) q6 is 0
+        by choice, and a pose that needs another q6 for the forearm to reach it counts as out of reach.
     """
     pose = np.asarray(pose_tip @ _inverse(tool))
     branch = np.arange(BRANCHES)
@@ -61,15 +62,13 @@ def solve(pose_tip: Array, tool: Array = T_TOOL0_TIP) -> Array:
             + np.pi / 2
         )
         s1, c1 = np.sin(q1), np.cos(q1)
-        cos5 = (t06[..., 0, 3] * s1 - t06[..., 1, 3] * c1 - DH_D[3]) / DH_D[5]
-        q5 = wrist * np.arccos(np.where(np.abs(cos5) < 1 + 1e-12, np.clip(cos5, -1.0, 1.0), np.nan))
-        s5 = np.sin(q5)
+        # sin q5 from the rotation, not from cos q5, which carries q5 to the square root of the rounding only.
+        sine = -t06[..., 0, 1] * s1 + t06[..., 1, 1] * c1
+        cosine = t06[..., 0, 0] * s1 - t06[..., 1, 0] * c1
+        s5 = wrist * np.hypot(sine, cosine)
+        q5 = np.arctan2(s5, t06[..., 0, 2] * s1 - t06[..., 1, 2] * c1)
         singular = np.abs(s5) < _SINGULAR
-        safe = np.where(singular, 1.0, s5)
-        q6 = np.arctan2(
-            (-t06[..., 0, 1] * s1 + t06[..., 1, 1] * c1) / safe,
-            (t06[..., 0, 0] * s1 - t06[..., 1, 0] * c1) / safe,
-        )
+        q6 = np.arctan2(wrist * sine, wrist * cosine)
         q6 = np.where(singular, 0.0, q6)
         t14 = _inverse(_link(0, q1)) @ t06 @ _inverse(_link(4, q5) @ _link(5, q6))
         p13 = t14[..., :3, 3] - DH_D[3] * t14[..., :3, 1]

@@ -282,6 +282,17 @@ def test_mouth_is_round_and_its_centre_is_the_tip(armed):
     assert load_cell().process.mouth_radius_m == MOUTH_RADIUS
 
 
+def test_the_nozzle_that_is_seen_is_the_one_that_collides(armed):
+    collides = armed.geom("gun/col_nozzle")
+    (seen,) = (
+        g
+        for g in range(armed.ngeom)
+        if armed.geom_dataid[g] == collides.dataid[0] and armed.geom_contype[g] == 0
+    )
+    np.testing.assert_array_equal(armed.geom_pos[seen], collides.pos)
+    np.testing.assert_array_equal(armed.geom_quat[seen], collides.quat)
+
+
 def test_mouth_clears_wall_and_plate_by_1_06_mm(armed):
     vertices = nozzle_vertices(armed)
     approach = np.array([0.0, -np.sqrt(0.5), np.sqrt(0.5)])  # the plate is z = 0, the wall y = 0
