@@ -57,7 +57,7 @@ format: $(VENV)/.setup-dev  ## let ruff mend format and imports
 	@$(VENV)/bin/ruff check --fix --exit-zero; $(VENV)/bin/ruff format
 
 bench: $(VENV)/.setup-test  ## speed figures
-	@$(PY) -m pytest tests/benchmarks -s $(ARGS)
+	@OMP_NUM_THREADS=1 $(PY) -m tests.benchmarks $(ARGS)
 
 clean:  ## remove the virtual environments, caches and out/
 	@rm -rf $(VENV) $(LATEST) out dist build .coverage .coverage.* htmlcov .mypy_cache .ruff_cache .pytest_cache \

@@ -14,7 +14,7 @@ from seal_gym.envs.seal_env import SealEnv
 mpl.use("Agg")  # no screen needed
 import matplotlib.pyplot as plt  # noqa: E402  # the backend has to be chosen first
 
-SPEED_UP = 3
+SPEED_UP = 5
 _STRIP = 176
 _GRID = (70, 74, 80)
 _CURVE = (90, 200, 255)

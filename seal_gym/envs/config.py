@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
+import numpy as np
+
 from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.errors import ConfigError, require
 from seal_gym.envs.adapters import CONTROLS, LeafFunction
@@ -17,6 +19,13 @@ OBSERVATIONS = ("features", "features+images")
 RENDERERS = ("raycast", "gl")
 
 
+def _whole(name: str, value: object, low: int, high: int) -> None:
+    require(
+        isinstance(value, int | np.integer) and low <= int(value) <= high,
+        f"{name} = {value!r}: must be a whole number in {low}..{high}",
+    )
+
+
 def check_num_envs(num_envs: object) -> None:
     """Refuses a number of simulations that cannot be.
 
@@ -26,10 +35,7 @@ def check_num_envs(num_envs: object) -> None:
     Raises:
         ConfigError: If it is not a whole number > 0.
     """
-    require(
-        isinstance(num_envs, int) and num_envs >= 1,
-        f"num_envs = {num_envs!r}: must be a whole number >= 1",
-    )
+    _whole("num_envs", num_envs, 1, 65536)
 
 
 def _one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
@@ -79,10 +85,7 @@ class SealCfg:
             f"leaves with control = {self.control!r}: only control='rmp' resolves leaves; use it or leave "
             "them out",
         )
-        require(
-            isinstance(self.threads, int) and 1 <= self.threads <= 256,
-            f"threads = {self.threads!r}: must be a whole number in 1..256",
-        )
+        _whole("threads", self.threads, 1, 256)
         object.__setattr__(self, "leaves", tuple(self.leaves))
 
     @classmethod

@@ -22,6 +22,7 @@ from seal_gym.tasks.progress import Progress
 from seal_gym.tasks.reward import reward
 from seal_gym.vision.features import RoiFeatures, SeamLines, ViewGeometry, oracle_lines, update_features
 from seal_gym.workpieces import catalogue
+from seal_gym.workpieces.seam import seam_in_world
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
@@ -47,7 +48,8 @@ OBSERVATION_ROWS = (
     ("qd_rad_s", 1.0, 10.0, 6),
 )
 _BOUND = np.concatenate([np.full(n, bound) for _, _, bound, n in OBSERVATION_ROWS])
-_LOWER = np.where([name.startswith("valid") for name, _, _, n in OBSERVATION_ROWS for _ in range(n)], 0, -_BOUND)
+_IS_FLAG = np.concatenate([np.full(n, name.startswith("valid")) for name, _, _, n in OBSERVATION_ROWS])
+_LOWER = np.where(_IS_FLAG, 0.0, -_BOUND)
 FEATURES = len(_BOUND)
 _X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 _MAX_DRAWS = 1000
@@ -161,6 +163,9 @@ class SealCore:
         hovering = self._draw_hover(rng)
         q = ik.nearest(ik.solve(part_pose @ hovering), self._reach.start_q)
         self.arm.reset(i, q, part_pose)
+        row = tip_kinematics(self.arm.q[i : i + 1], self.arm.qd[i : i + 1])
+        for values, new in zip(self.tip, row, strict=True):
+            values[i] = new[0]
         self.sensors.reset(i, rng)
         self.progress.reset(i, hovering[:3, 3])
         self._rate.reset(i)
@@ -186,7 +191,7 @@ class SealCore:
             f"sideways_m = {task.sideways_m} or turned_rad = {task.turned_rad}"
         )
 
-    def step(self, action: Array) -> StepResult:
+    def step(self, action: NDArray[Any]) -> StepResult:
         """Advances all simulations by one frame; call ``observe`` for what they then see.
 
         Args:
@@ -226,7 +231,7 @@ class SealCore:
 
     # -- the parts of a step ----------------------------------------------------------------------------
 
-    def _checked(self, action: Array) -> Array:
+    def _checked(self, action: NDArray[Any]) -> Array:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self.n, self.adapter.size):
             raise ActionError(
@@ -238,7 +243,7 @@ class SealCore:
             raise ActionError(
                 f"action{bad} = {action[tuple(bad)]}: must be finite; values beyond [-1, 1] are clipped"
             )
-        return np.minimum(np.maximum(action, -1.0), 1.0)
+        return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0), dtype=np.float64)
 
     def _arm_state(self) -> ArmState:
         """The commanded motion: integrating along it keeps the servo's lag out of the policy's loop."""
@@ -285,11 +290,7 @@ class SealCore:
         return StepResult(value, reached, touched, lost, timeout)
 
     def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
-        seen = self._seam.at(self.progress.s)
-        part = self.arm.part_pose
-        point = (part[:, :3, :3] @ seen.position[:, :, None])[..., 0] + part[:, :3, 3]
-        tangent = (part[:, :3, :3] @ seen.tangent[:, :, None])[..., 0]
-        self.tip = tip_kinematics(self.arm.q, self.arm.qd)
+        point, tangent = seam_in_world(self._seam, self.progress.s, self.arm.part_pose)
         self.lines = oracle_lines(point, tangent, self.tip.pose, self._views)
         update_features(self.features, self.lines, self._views)
         self._rate.update(
@@ -313,7 +314,7 @@ class SealCore:
         rows[:, 17:23] = self._tip_accel
         rows[:, 23:29] = self.arm.q
         rows[:, 29:35] = self.arm.qd
-        return np.minimum(np.maximum(rows, _LOWER), _BOUND).astype(np.float32)
+        return np.asarray(np.minimum(np.maximum(rows, _LOWER), _BOUND), dtype=np.float32)
 
     # -- what others may ask ----------------------------------------------------------------------------
 
@@ -389,7 +390,8 @@ class SealCore:
             See ``SealEnv``.
         """
         f = self.features
-        collision, reached = (False, False) if result is None else (bool(result.collision[i]), bool(result.reached[i]))
+        collision = result is not None and bool(result.collision[i])
+        reached = result is not None and bool(result.reached[i])
         info: dict[str, Any] = {
             "tip_error_mm": float(_MM * self.progress.error_m[i]),
             "progress": float(self.progress.share[i]),

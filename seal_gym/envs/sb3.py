@@ -198,8 +198,8 @@ class SealSb3VecEnv(VecEnv):
         if name in ("action_space", "core", "observation_space", "render_mode"):
             return getattr(self, name)
         raise AttributeError(
-            f"no attribute {name!r}: the rows have action_space, core, metadata, np_random, observation_space, "
-            f"render_mode and what set_attr gave them {sorted(self._attributes[i])}"
+            f"no attribute {name!r}: the rows have action_space, core, metadata, np_random, "
+            f"observation_space, render_mode and what set_attr gave them {sorted(self._attributes[i])}"
         )
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

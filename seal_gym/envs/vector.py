@@ -182,12 +182,12 @@ class SealVectorEnv(VectorEnv, EzPickle):
             f"reset_mask = {mask!r}: must be a boolean array of shape ({self.num_envs},)",
         )
         require(bool(mask.any()), "reset_mask chooses no row: at least one must be True")
-        return mask.copy()
+        return np.array(mask, dtype=np.bool_)
 
     # -- info -------------------------------------------------------------------------------------------
 
     def _info(self, rows: NDArray[np.bool_] | None, result: StepResult | None) -> dict[str, Any]:
-        """``SealCore.info`` of all rows, or of a reset's, at once; masked as gymnasium's ``_add_info`` does."""
+        """``SealCore.info`` of all rows, or of a reset's, at once; masked as gymnasium's ``_add_info``."""
         core, n = self.core, self.num_envs
         shown = np.ones(n, np.bool_) if rows is None else rows
         no = np.zeros(n, np.bool_)
@@ -213,7 +213,7 @@ class SealVectorEnv(VectorEnv, EzPickle):
 
     # -- the rest ---------------------------------------------------------------------------------------
 
-    @property
+    @property  # type: ignore[misc]  # gymnasium's has a setter
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]  # one a row
         """The rows' generators; None for a row that was never reset."""
         return tuple(self._rngs)

@@ -26,7 +26,7 @@ _TRAIL_RGBA = np.array([1.0, 0.45, 0.10, 1.0], np.float32)
 _TRAIL_STEP_M = 2e-3
 _TRAIL_RADIUS_M = 8e-4
 # Viewing direction of the close-up in the tip frame.
-_CLOSE_VIEW = normalise(np.array([-0.75, -0.60, -0.45]))
+_CLOSE_VIEW = normalise(np.array([-0.34, -0.62, -0.72]))
 
 
 def check_render_mode(render_mode: str | None, allowed: list[str]) -> None:
@@ -85,7 +85,7 @@ class SceneView:
         self._viewer_data: mujoco.MjData | None = None
 
     def picture(self) -> NDArray[np.uint8]:
-        """The cell from the free side of the bench; beside it a close-up of the nozzle and the two ROIs.
+        """The nozzle from ahead on its free side; beside it the two ROIs and the whole cell.
 
         The orange trail is the way of the nozzle mouth on the part.
 
@@ -97,7 +97,7 @@ class SceneView:
         """
         self._extend_trail()
         out = np.full((HEIGHT, WIDTH, 3), _BACK_RGB, np.uint8)
-        out[:, : WIDTH - _PANEL] = self._shot("wide", HEIGHT, WIDTH - _PANEL, self._wide())
+        out[:, : WIDTH - _PANEL] = self._shot("nozzle", HEIGHT, WIDTH - _PANEL, self._close())
         core = self._core
         images = core.sensors.images(core.tip.pose, core.arm, core.frames)
         top = 0
@@ -109,7 +109,7 @@ class SceneView:
             )
             top = self._place(out, inset, top, f"{camera.name} view")
         height = HEIGHT - top - 30
-        self._place(out, self._shot("close", height, _PANEL - 4, self._close()), top, "nozzle")
+        self._place(out, self._shot("cell", height, _PANEL - 4, self._wide()), top, "cell")
         return out
 
     @staticmethod
@@ -126,7 +126,11 @@ class SceneView:
         from seal_gym.sim.gl import offscreen  # noqa: PLC0415  # loads OpenGL: only for pictures
 
         if name not in self._renderers:
-            self._renderers[name] = offscreen(self._core.scene.model, height, width)
+            renderer = offscreen(self._core.scene.model, height, width)
+            # Nothing here mirrors, and software OpenGL is slow: shadows only where they show depth.
+            renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_REFLECTION)] = False
+            renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] = name == "nozzle"
+            self._renderers[name] = renderer
         renderer = self._renderers[name]
         option = mujoco.MjvOption()
         option.geomgroup[GROUP_COLLISION] = 0
@@ -137,8 +141,8 @@ class SceneView:
 
     def _wide(self) -> mujoco.MjvCamera:
         camera = mujoco.MjvCamera()
-        camera.lookat[:] = self._core.arm.part_pose[0, :3, 3] + [-0.10, 0.0, 0.12]
-        camera.distance, camera.azimuth, camera.elevation = 1.0, 205.0, -38.0
+        camera.lookat[:] = self._core.arm.part_pose[0, :3, 3] + [-0.14, 0.0, 0.14]
+        camera.distance, camera.azimuth, camera.elevation = 1.1, 205.0, -30.0
         return camera
 
     def _close(self) -> mujoco.MjvCamera:
@@ -147,7 +151,7 @@ class SceneView:
         view = pose[:3, :3] @ _CLOSE_VIEW
         camera = mujoco.MjvCamera()
         camera.lookat[:] = pose[:3, 3] + 0.006 * pose[:3, 2]
-        camera.distance = 0.13
+        camera.distance = 0.24
         camera.azimuth = float(np.rad2deg(np.arctan2(view[1], view[0])))
         camera.elevation = float(np.rad2deg(np.arcsin(np.clip(view[2], -1.0, 1.0))))
         return camera

@@ -3,7 +3,57 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from seal_gym.core.frames import Array, cross, normalise
+from seal_gym.core.frames import Array
+from seal_gym.core.jit import kernel
+
+
+@kernel
+def _update(
+    point: Array,
+    direction: Array,
+    tip_pose: Array,
+    valid: NDArray[np.bool_],
+    fresh: NDArray[np.bool_],
+    dt: float,
+    gain: float,
+    twist: Array,
+    last_point: Array,
+    last_direction: Array,
+    seen: NDArray[np.bool_],
+) -> None:
+    p, d, mean, shift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(point.shape[0]):
+        if not fresh[i]:
+            continue
+        size = along = 0.0
+        for r in range(3):
+            p[r], d[r] = tip_pose[i, r, 3], 0.0
+            for k in range(3):
+                p[r] += tip_pose[i, r, k] * point[i, k]
+                d[r] += tip_pose[i, r, k] * direction[i, k]
+            # The chord of an arc is parallel to the mean of its end tangents: travel along the seam drops out.
+            mean[r] = d[r] + last_direction[i, r]
+            shift[r] = p[r] - last_point[i, r]
+            size += mean[r] * mean[r]
+            along += shift[r] * mean[r]
+        both = valid[i] and seen[i] and size > 0.0
+        weight = gain if both or not valid[i] else 0.0
+        if both:
+            for r in range(3):
+                shift[r] -= along / size * mean[r]
+        q = last_direction[i]
+        turn = (q[1] * d[2] - q[2] * d[1], q[2] * d[0] - q[0] * d[2], q[0] * d[1] - q[1] * d[0])
+        for r in range(3):
+            v = w = 0.0
+            if both and r != 1:
+                for k in range(3):
+                    v += tip_pose[i, k, r] * shift[k] / dt
+                    w += tip_pose[i, k, r] * turn[k] / dt
+            twist[i, r] += weight * (v - twist[i, r])
+            twist[i, 3 + r] += weight * (w - twist[i, 3 + r])
+        for r in range(3):
+            last_point[i, r], last_direction[i, r] = p[r], d[r]
+        seen[i] = valid[i]
 
 
 class SeamRate:
@@ -58,21 +108,17 @@ class SeamRate:
             valid: Whether the line was seen, shape (N,).
             rows: Simulations that have a new frame, shape (N,), all by default.
         """
-        rotation = tip_pose[:, :3, :3]
-        p = (rotation @ point[:, :, None])[..., 0] + tip_pose[:, :3, 3]
-        d = (rotation @ direction[:, :, None])[..., 0]
-        # The chord of an arc is parallel to the mean of its end tangents: travel along the seam drops out.
-        mean = normalise(d + self._direction + 1e-12)
-        shift = p - self._point
-        shift -= mean * np.sum(shift * mean, axis=1, keepdims=True)
-        turn = cross(self._direction, d)
-        world = np.stack((shift, turn), axis=1) / self._dt
-        raw = (world @ rotation).reshape(-1, 6)
-        raw[:, 1] = raw[:, 4] = 0.0
-        gain = np.where(valid, self._gain * self._seen, self._gain)[:, None]
-        if rows is not None:
-            gain = gain * rows[:, None]
-            p, d = np.where(rows[:, None], p, self._point), np.where(rows[:, None], d, self._direction)
-            valid = np.where(rows, valid, self._seen)
-        self.twist += gain * (np.where((valid & self._seen)[:, None], raw, 0.0) - self.twist)
-        self._point, self._direction, self._seen = p, d, valid.copy()
+        fresh = np.ones(len(point), np.bool_) if rows is None else rows
+        _update(
+            point,
+            direction,
+            tip_pose,
+            valid,
+            fresh,
+            self._dt,
+            self._gain,
+            self.twist,
+            self._point,
+            self._direction,
+            self._seen,
+        )

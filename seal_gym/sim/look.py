@@ -127,8 +127,19 @@ class Look(NamedTuple):
         """
         lamp = np.zeros((n, 3))
         lamp[:, 2] = 1.0
-        one = [np.zeros(n) for _ in range(8)]
-        return cls(lamp, *one[:5], np.zeros((n, 2)), *one[5:], np.zeros(n, np.uint64))
+        return cls(
+            lamp=lamp,
+            ambient=np.zeros(n),
+            diffuse=np.zeros(n),
+            contrast=np.zeros(n),
+            brightness=np.zeros(n),
+            texture=np.zeros(n),
+            texture_offset=np.zeros((n, 2)),
+            noise_sigma=np.zeros(n),
+            blur_px=np.zeros(n),
+            clip_fraction=np.zeros(n),
+            seed=np.zeros(n, np.uint64),
+        )
 
     def draw(self, i: int, rng: np.random.Generator, cfg: LookCfg) -> None:
         """Fills row ``i``; takes the same number of draws whatever the configuration.

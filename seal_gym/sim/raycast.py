@@ -88,7 +88,7 @@ class _Mesh(NamedTuple):
 class _View(NamedTuple):
     """A camera's geometry and the nozzle in front of it."""
 
-    index: int
+    number: int  # 0 front, 1 side
     rotation: Array  # R_tip_camera, (3, 3)
     position: Array  # in the tip frame, (3,)
     ray_x: Array  # x of the rays (x, y, 1) through the pixels' centres, (width,)
@@ -121,6 +121,7 @@ class _Buffers(NamedTuple):
     near: Array  # largest 1 / z, (height, width)
     owner: Ints  # index into _Shown, -1 for none, (height, width)
     slot: Ints  # index among the edge pixels, -1 for none, (height, width)
+    ends: Ints  # first and last + 1 column with an edge, (height, 2)
     sub_near: Array  # (pixels, 16)
     sub_owner: Ints  # (pixels, 16)
     picture: Array  # (height, 3 width)
@@ -163,7 +164,7 @@ def _hidden(
     along = x * axis[0] + y * axis[1] + z * axis[2]
     across = math.sqrt(max(0.0, x * x + y * y + z * z - along * along))
     reach = sphere[k, 3]
-    return along < -reach or across * cone_cos - along * cone_sin > reach
+    return bool(along < -reach or across * cone_cos - along * cone_sin > reach)
 
 
 @kernel
@@ -181,7 +182,7 @@ def _pixel_box(a: Array, b: Array, c: Array, ray_x: Array, ray_y: Array, focal: 
     box[1] = int(min(max((max(xa, xb, xc) - left) * f + 2.5, 0.0), width + 0.0))
     box[2] = int(min(max((min(ya, yb, yc) - top) * f - 0.5, 0.0), height + 0.0))
     box[3] = int(min(max((max(ya, yb, yc) - top) * f + 2.5, 0.0), height + 0.0))
-    return box[0] < box[1] and box[2] < box[3]
+    return bool(box[0] < box[1] and box[2] < box[3])
 
 
 @kernel
@@ -238,21 +239,58 @@ def _select(
 
 
 @kernel
+def _at(table: Array, k: int, first: int, x: float, y: float) -> float:
+    """A linear function of the ray, from a table."""
+    return float(table[k, first] * x + (table[k, first + 1] * y + table[k, first + 2]))
+
+
+@kernel
+def _per_slope(a: float, focal: float) -> float:
+    """Columns per unit of a linear function; 0 for one that does not change along a row."""
+    return focal / a if abs(a) > 1e-30 else 0.0
+
+
+@kernel
+def _narrow(per: float, c: float, origin: float, first: int, last: int) -> tuple[int, int]:
+    """Columns among first..last - 1 where a x + c can be >= 0, with one to spare for rounding."""
+    # Clamped before the conversion to integers, which must not overflow.
+    zero = min(max(-c * per - origin, -4.0), last + 4.0)
+    if per > 0.0:
+        return max(first, int(zero) - 1), last
+    if per < 0.0:
+        return first, min(last, int(zero) + 3)
+    return first, last
+
+
+@kernel
 def _rasterise(
-    edge: Array, face: Array, box: Ints, count: int, ray_x: Array, ray_y: Array, near: Array, owner: Ints
+    edge: Array,
+    face: Array,
+    box: Ints,
+    count: int,
+    ray_x: Array,
+    ray_y: Array,
+    focal: float,
+    near: Array,
+    owner: Ints,
 ) -> None:
     """Nearest triangle of each ray in the grid ray_x, ray_y."""
     near[:] = 0.0
     owner[:] = -1
+    origin = ray_x[0] * focal
     for k in range(count):
         ax, bx, cx, wx = edge[k, 0], edge[k, 3], edge[k, 6], face[k, 0]
-        first, last = box[k, 0], box[k, 1]
+        a_per, b_per, c_per = _per_slope(ax, focal), _per_slope(bx, focal), _per_slope(cx, focal)
         for i in range(box[k, 2], box[k, 3]):
             y = ray_y[i]
             a0 = edge[k, 1] * y + edge[k, 2]
             b0 = edge[k, 4] * y + edge[k, 5]
             c0 = edge[k, 7] * y + edge[k, 8]
             w0 = face[k, 1] * y + face[k, 2]
+            # A long thin triangle fills little of its box.
+            first, last = _narrow(a_per, a0, origin, box[k, 0], box[k, 1])
+            first, last = _narrow(b_per, b0, origin, first, last)
+            first, last = _narrow(c_per, c0, origin, first, last)
             for j in range(first, last):
                 x = ray_x[j]
                 if ax * x + a0 >= 0.0 and bx * x + b0 >= 0.0 and cx * x + c0 >= 0.0:
@@ -263,18 +301,12 @@ def _rasterise(
 
 
 @kernel
-def _at(table: Array, k: int, first: int, x: float, y: float) -> float:
-    """A linear function of the ray, from a table."""
-    return table[k, first] * x + (table[k, first + 1] * y + table[k, first + 2])
-
-
-@kernel
 def _folded(a: int, b: int, plane: Array, material: Ints) -> bool:
     """Whether two of the mesh's triangles differ in material or direction."""
     if material[a] != material[b]:
         return True
     cosine = plane[a, 0] * plane[b, 0] + plane[a, 1] * plane[b, 1] + plane[a, 2] * plane[b, 2]
-    return cosine < _EDGE_COS
+    return bool(cosine < _EDGE_COS)
 
 
 @kernel
@@ -287,10 +319,8 @@ def _torn(p: int, q: int, face: Array, xp: float, yp: float, xq: float, yq: floa
 
 
 @kernel
-def _mark_edges(
-    mesh: _Mesh, shown: _Shown, ray_x: Array, ray_y: Array, alpha: Array, owner: Ints, slot: Ints
-) -> int:
-    """Numbers the pixels on either side of an edge; returns how many.
+def _mark_edges(mesh: _Mesh, shown: _Shown, ray_x: Array, ray_y: Array, owner: Ints, slot: Ints) -> None:
+    """Marks the pixels on either side of an edge with -2.
 
     An edge that cuts a pixel has the centre of one of its four neighbours on its other side, unless it ends
     there.
@@ -298,27 +328,41 @@ def _mark_edges(
     plane, material, face, which = mesh.plane, mesh.material, shown.face, shown.which
     height, width = owner.shape
     slot[:] = -1
-    count = 0
     for step in range(2):
         for i in range(height - step):
             for j in range(width - 1 + step):
                 r, c = i + step, j + 1 - step
                 p, q = owner[i, j], owner[r, c]
-                if p == q:
-                    continue
-                # Both pixels, although the edge crosses but one of them between the two centres.
-                if (
+                if p != q and (
                     p < 0
                     or q < 0
                     or _folded(which[p], which[q], plane, material)
                     or _torn(p, q, face, ray_x[j], ray_y[i], ray_x[c], ray_y[r])
                 ):
-                    if slot[i, j] < 0 and alpha[i, j] < 1.0:
-                        slot[i, j] = count
-                        count += 1
-                    if slot[r, c] < 0 and alpha[r, c] < 1.0:
-                        slot[r, c] = count
-                        count += 1
+                    slot[i, j] = -2
+                    slot[r, c] = -2
+
+
+@kernel
+def _number_edges(alpha: Array, slot: Ints, ends: Ints) -> int:
+    """Numbers the marked pixels and their neighbours, where edges may end; returns how many."""
+    height, width = slot.shape
+    for i in range(height):
+        for j in range(width):
+            if slot[i, j] == -2:
+                for r, c in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                    if 0 <= r < height and 0 <= c < width and slot[r, c] == -1:
+                        slot[r, c] = -3
+    count = 0
+    for i in range(height):
+        ends[i, 0], ends[i, 1] = width, 0
+        for j in range(width):
+            if slot[i, j] < -1:
+                slot[i, j] = -1
+                if alpha[i, j] < 1.0:
+                    slot[i, j] = count
+                    count += 1
+                    ends[i, 0], ends[i, 1] = min(ends[i, 0], j), j + 1
     return count
 
 
@@ -341,22 +385,37 @@ def _resample(
     count: int,
     ray_x: Array,
     ray_y: Array,
+    focal: float,
     lattice: Array,
     slot: Ints,
+    ends: Ints,
     near: Array,
     owner: Ints,
     edges: int,
 ) -> None:
-    """Sixteen rays through each edge pixel, against the triangles whose boxes hold it."""
+    """Sixteen rays through each edge pixel, against the triangles that may touch it."""
     edge, face, box = shown.edge, shown.face, shown.box
     near[:edges] = 0.0
     owner[:edges] = -1
+    origin, half = ray_x[0] * focal, 0.5 / focal
+    per, slack = np.empty(3), np.empty(3)
     for k in range(count):
+        for n in range(3):
+            per[n] = _per_slope(edge[k, 3 * n], focal)
+            # The largest value in a pixel counts, not that at its centre.
+            slack[n] = (abs(edge[k, 3 * n]) + abs(edge[k, 3 * n + 1])) * half
         for i in range(box[k, 2], box[k, 3]):
-            for j in range(box[k, 0], box[k, 1]):
+            first, last = max(box[k, 0], ends[i, 0]), min(box[k, 1], ends[i, 1])
+            if first >= last:
+                continue
+            y = ray_y[i]
+            for n in range(3):
+                c = edge[k, 3 * n + 1] * y + edge[k, 3 * n + 2] + slack[n]
+                first, last = _narrow(per[n], c, origin, first, last)
+            for j in range(first, last):
                 e = slot[i, j]
                 if e >= 0:
-                    _resample_pixel(k, edge, face, ray_x[j], ray_y[i], lattice, e, near, owner)
+                    _resample_pixel(k, edge, face, ray_x[j], y, lattice, e, near, owner)
 
 
 @kernel
@@ -370,13 +429,13 @@ def _texel(grain: Array, u: float, v: float) -> float:
     c1, r1 = (c0 + 1) & _TEXEL_MASK, (r0 + 1) & _TEXEL_MASK
     upper = grain[r0, c0] + fu * (grain[r0, c1] - grain[r0, c0])
     lower = grain[r1, c0] + fu * (grain[r1, c1] - grain[r1, c0])
-    return upper + fv * (lower - upper)
+    return float(upper + fv * (lower - upper))
 
 
 @kernel
 def _tint(k: int, x: float, y: float, face: Array, grain: Array, shift_u: float, shift_v: float) -> float:
     """Factor by which the texture changes triangle k's colour along the ray (x, y, 1)."""
-    strength = face[k, 12]
+    strength = float(face[k, 12])
     if strength == 0.0:
         return 1.0
     z = 1.0 / _at(face, k, 0, x, y)
@@ -592,7 +651,7 @@ def _sense(
             out[i, j, 1] = np.uint8(np.int64(min(max(g + noise, 0.0), 255.0)))
             out[i, j, 2] = np.uint8(np.int64(min(max(b + noise, 0.0), 255.0)))
     mean = total / (height * width)
-    return max(0.0, squares / (height * width) - mean * mean)
+    return float(max(0.0, squares / (height * width) - mean * mean))
 
 
 @kernel
@@ -606,23 +665,6 @@ def _sense_batch(
 
 
 @kernel
-def _room(n: int, height: int, width: int) -> tuple[_Shown, _Buffers]:
-    """Scratch for n triangles and a ROI."""
-    shown = _Shown(np.empty((n, 9)), np.empty((n, 13)), np.empty((n, 4), np.int32), np.empty(n, np.int32))
-    buffers = _Buffers(
-        np.empty((height, width)),
-        np.empty((height, width), np.int32),
-        np.empty((height, width), np.int32),
-        np.empty((height * width, _SAMPLES)),
-        np.empty((height * width, _SAMPLES), np.int32),
-        np.empty((height, 3 * width)),
-        np.empty((height, 3 * width)),
-        np.empty((2, _BINS), np.int64),
-    )
-    return shown, buffers
-
-
-@kernel
 def _render_batch(
     mesh: _Mesh,
     view: _View,
@@ -632,22 +674,58 @@ def _render_batch(
     part: Array,
     first: int,
     last: int,
+    shown: _Shown,
+    b: _Buffers,
     out: Bytes,
     variance: Array,
 ) -> None:
     """Frames first..last - 1 of one view."""
     ray_x, ray_y = view.ray_x, view.ray_y
-    shown, b = _room(len(mesh.corner), len(ray_y), len(ray_x))
     rot, eye, lamp = np.empty((3, 3)), np.empty(3), np.empty(3)
     for row in range(first, last):
         _part_to_camera(tip[row], part[row], view, look.lamp[row], rot, eye, lamp)
         count = _select(mesh, view, look, row, rot, eye, lamp, shown)
-        _rasterise(shown.edge, shown.face, shown.box, count, ray_x, ray_y, b.near, b.owner)
-        edges = _mark_edges(mesh, shown, ray_x, ray_y, view.alpha, b.owner, b.slot)
-        _resample(shown, count, ray_x, ray_y, view.lattice, b.slot, b.sub_near, b.sub_owner, edges)
+        _rasterise(shown.edge, shown.face, shown.box, count, ray_x, ray_y, view.focal, b.near, b.owner)
+        _mark_edges(mesh, shown, ray_x, ray_y, b.owner, b.slot)
+        edges = _number_edges(view.alpha, b.slot, b.ends)
+        _resample(
+            shown,
+            count,
+            ray_x,
+            ray_y,
+            view.focal,
+            view.lattice,
+            b.slot,
+            b.ends,
+            b.sub_near,
+            b.sub_owner,
+            edges,
+        )
         _paint(mesh.grain, view, shown.face, look, row, b)
         _paint_nozzle(view.alpha, view.tool_normal, view.tool_albedo, look, row, b.picture)
-        variance[row] = _sense(b.picture, b.work, b.bins, look, row, view.index, frame[row], out[row])
+        variance[row] = _sense(b.picture, b.work, b.bins, look, row, view.number, frame[row], out[row])
+
+
+def _room(triangles: int, height: int, width: int) -> tuple[_Shown, _Buffers]:
+    """Scratch for a mesh and a ROI."""
+    shown = _Shown(
+        edge=np.empty((triangles, 9)),
+        face=np.empty((triangles, 13)),
+        box=np.empty((triangles, 4), np.int32),
+        which=np.empty(triangles, np.int32),
+    )
+    buffers = _Buffers(
+        near=np.empty((height, width)),
+        owner=np.empty((height, width), np.int32),
+        slot=np.empty((height, width), np.int32),
+        ends=np.empty((height, 2), np.int32),
+        sub_near=np.empty((height * width, _SAMPLES)),
+        sub_owner=np.empty((height * width, _SAMPLES), np.int32),
+        picture=np.empty((height, 3 * width)),
+        work=np.empty((height, 3 * width)),
+        bins=np.empty((2, _BINS), np.int64),
+    )
+    return shown, buffers
 
 
 def _snr_db(variance: Array, sigma: Array) -> Array:
@@ -739,7 +817,7 @@ def _tool_layer(
     fine_x, fine_y = ((r[:, None] + step).ravel() for r in rays)
     box = np.tile(np.array([0, len(fine_x), 0, len(fine_y)], np.int32), (len(front), 1))
     near, owner = np.empty((len(fine_y), len(fine_x))), np.empty((len(fine_y), len(fine_x)), np.int32)
-    _rasterise(edge, face, box, len(front), fine_x, fine_y, near, owner)
+    _rasterise(edge, face, box, len(front), fine_x, fine_y, n * float(camera.focal_px), near, owner)
     edge_1, edge_2 = tool[:, 1] - tool[:, 0], tool[:, 2] - tool[:, 0]
     normal = cross(edge_1, edge_2)
     length = np.sqrt(np.sum(normal * normal, axis=1, keepdims=True))
@@ -751,7 +829,7 @@ def _tool_layer(
     return hit / n**2, _grid(total / np.maximum(hit, 1)[..., None])
 
 
-def _view_of(index: int, camera: CameraCfg, tool: Array) -> _View:
+def _view_of(number: int, camera: CameraCfg, tool: Array) -> _View:
     rotation, position, centre = _grid(camera.rotation), _grid(camera.position_m), _grid(camera.centre_px)
     focal = float(camera.focal_px)
     ray_x = (np.arange(camera.width) + 0.5 - centre[0]) / focal
@@ -767,7 +845,7 @@ def _view_of(index: int, camera: CameraCfg, tool: Array) -> _View:
     cosine = float(min(np.sum(axis * s) for s in sides))
     alpha, normal = _tool_layer(tool, camera, rotation, position, (ray_x, ray_y))
     return _View(
-        index=index,
+        number=number,
         rotation=rotation,
         position=position,
         ray_x=ray_x,
@@ -812,6 +890,15 @@ class Raycaster:
         )
         self._mesh = _mesh_of(surface)
         self._views = tuple(_view_of(k, camera, tool) for k, camera in enumerate(cell.cameras))
+        # Fresh memory costs more than half of what is done in it: one set for each thread that ever drew.
+        self._rooms: list[list[tuple[_Shown, _Buffers]]] = []
+
+    def _take_rooms(self) -> list[tuple[_Shown, _Buffers]]:
+        try:
+            return self._rooms.pop()  # atomic, unlike asking for the length first
+        except IndexError:
+            n = len(self._mesh.corner)
+            return [_room(n, len(v.ray_y), len(v.ray_x)) for v in self._views]
 
     @property
     def nozzle_alpha(self) -> tuple[Array, Array]:
@@ -852,8 +939,10 @@ class Raycaster:
         variance = np.empty((2, n))
 
         def draw(first: int, last: int) -> None:
-            for view, image, var in zip(self._views, images, variance, strict=True):
-                _render_batch(self._mesh, view, look, counters, tip, part, first, last, image, var)
+            rooms = self._take_rooms()
+            for view, room, image, var in zip(self._views, rooms, images, variance, strict=True):
+                _render_batch(self._mesh, view, look, counters, tip, part, first, last, *room, image, var)
+            self._rooms.append(rooms)
 
         parts = min(threads, n)
         if parts <= 1:

@@ -7,17 +7,24 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from seal_gym.core.errors import SeamError, require
+from seal_gym.core.errors import SeamError
 from seal_gym.core.frames import Array, tip_rotation, transform, yaw_pose
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, tip_kinematics
 from seal_gym.planning import ik
 from seal_gym.sim.scene import Scene
+from seal_gym.workpieces.seam import Seam
 
 _STEP_M = 5e-3
 # Below this the tip's speed costs joint speeds the arm does not have (smallest singular value, rotation
 # scaled by the distance from flange to mouth).
 _MIN_SINGULAR = 0.05
 _LENGTH_M = 0.25
+_TURN_RAD = np.deg2rad(15.0)
+# From station to station no joint turns as far, unless the branch ends in between.
+_JUMP_RAD = 1.0
+_ELBOW_UP = 5
+_TRY_DISTANCE_M = (0.45, 0.35, 0.40, 0.50)
+_TRY_YAW_RAD = (0.0, 0.79, 1.57, 2.36, 3.14, -2.36, -1.57, -0.79)
 
 
 class Reach(NamedTuple):
@@ -54,42 +61,77 @@ def check_reach(scene: Scene, shift_m: float, yaw_rad: float) -> Reach:
 
     Raises:
         SeamError: If a stretch is out of reach, at a joint limit or singular, or gun, arm or cameras touch
-            something there; the message names the place.
+            something there; the message names the place, and a pose that would do if there is one.
     """
-    part, seam = scene.workpiece, scene.workpiece.seam
-    s = np.linspace(0.0, seam.length, int(np.ceil(seam.length / _STEP_M)) + 1)
+    part = scene.workpiece
+    displacements = _displacements(shift_m, yaw_rad)
+    found = _try(scene, part.pose, displacements, _STEP_M)
+    if isinstance(found, Reach):
+        return found
+    better = _better_pose(scene, displacements)
+    raise SeamError(
+        f"workpiece {part.name!r} cannot be sealed by this cell: {found}. "
+        + (
+            f"It can with pose=({', '.join(f'{v:.3g}' for v in better)})"
+            if better
+            else "Nor at other places and angles that were tried: change the part, or seal it in shorter seams"
+        )
+        + f"; the part may be displaced by {shift_m * 1e3:.0f} mm and {np.rad2deg(yaw_rad):.0f} deg"
+    )
+
+
+def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) -> Reach | str:
+    """How the arm seals the part at a nominal pose, or why it cannot."""
+    seam = scene.workpiece.seam
+    s = _stations(seam, step_m)
     p, t, a = seam.at(s)
     tip = transform(tip_rotation(t, a), p + scene.cell.process.stand_off_m * a)
-    displaced = part.pose @ _displacements(shift_m, yaw_rad)
-    poses = displaced[:, None] @ tip[None]
-    q = np.unwrap(ik.solve(poses), axis=1)  # (displacement, station, branch, joint)
+    displaced = part_pose @ displacements
+    q = np.unwrap(ik.solve(displaced[:, None] @ tip[None]), axis=1)  # (displacement, station, branch, joint)
     # A whole turn more or less keeps the posture: bring the middle of each joint's travel near zero.
-    with np.errstate(invalid="ignore"):
-        q -= 2 * np.pi * np.round(np.mean(q, axis=1, keepdims=True) / (2 * np.pi))
-    blocked = [_why_not(q[:, :, b], s) for b in range(ik.BRANCHES)]
-    open_branches = [b for b, why in enumerate(blocked) if not why]
-    # Elbow up first: the branch of the nominal parts, which keeps the forearm off the table.
-    order = sorted(open_branches, key=lambda b: b != 5)
-    reasons = []
+    q -= 2 * np.pi * np.round((q.max(axis=1, keepdims=True) + q.min(axis=1, keepdims=True)) / (4 * np.pi))
+    fits = [_fit(q[:, :, b], s) for b in range(ik.BRANCHES)]
+    # Elbow up first: the branch of the nominal parts, which keeps the forearm off the table. Then the
+    # branch that stays farthest from a singularity.
+    order = sorted(range(ik.BRANCHES), key=lambda b: (b != _ELBOW_UP, -fits[b].singular))
+    touching = ""
     for b in order:
-        touching = _touching(scene, q[:, :, b], displaced, s)
-        if not touching:
+        if fits[b].why:
+            continue
+        why = _touching(scene, q[:, :, b], displaced, s)
+        if not why:
             flat = q[:, :, b].reshape(-1, 6)
             return Reach(
                 start_q=q[0, 0, b],
-                smallest_singular=float(_smallest_singular(flat).min()),
+                smallest_singular=fits[b].singular,
                 joint_range=np.stack((flat.min(axis=0), flat.max(axis=0))),
             )
-        reasons.append(touching)
-    why = reasons[0] if reasons else blocked[5]
-    require(
-        False,
-        f"workpiece {part.name!r} cannot be sealed by this cell: {why}. Move or turn the part (pose=), or "
-        f"change the seam; the part may be displaced by {shift_m * 1e3:.0f} mm and "
-        f"{np.rad2deg(yaw_rad):.0f} deg",
-        SeamError,
-    )
-    raise AssertionError  # require has raised
+        touching = touching or why
+    return touching or fits[_ELBOW_UP].why
+
+
+def _stations(seam: Seam, step_m: float) -> Array:
+    """Arc lengths to look at: closer together where the seam turns, so that no joint turns far in between."""
+    turn = np.linalg.norm(np.diff(seam.tangent, axis=0), axis=1)
+    effort = np.concatenate(([0.0], np.cumsum(np.diff(seam.arc) / step_m + turn / _TURN_RAD)))
+    first, last = np.interp([0.0, seam.length], seam.arc, effort)
+    s = np.interp(np.linspace(first, last, int(np.ceil(last - first)) + 1), effort, seam.arc)
+    s[[0, -1]] = 0.0, seam.length
+    return s
+
+
+def _better_pose(scene: Scene, displacements: Array) -> tuple[float, float, float, float] | None:
+    """A pose x, y, z, yaw at which the part can be sealed: other angles, nearer to and farther from the arm."""
+    seam = scene.workpiece.seam
+    inside = seam.position[(seam.arc >= 0) & (seam.arc <= seam.length)]
+    middle = (inside.min(axis=0) + inside.max(axis=0)) / 2
+    height = scene.workpiece.pose[2, 3]
+    for distance, yaw in product(_TRY_DISTANCE_M, _TRY_YAW_RAD):
+        at = np.round([distance, 0.0, height] - yaw_pose(0, 0, 0, yaw)[:3, :3] @ (middle * [1, 1, 0]), 3)
+        pose = yaw_pose(*at, yaw)
+        if all(isinstance(_try(scene, pose, displacements, step), Reach) for step in (4 * _STEP_M, _STEP_M)):
+            return float(at[0]), float(at[1]), float(at[2]), float(yaw)
+    return None
 
 
 def _smallest_singular(q: Array) -> Array:
@@ -98,21 +140,29 @@ def _smallest_singular(q: Array) -> Array:
     return np.asarray(np.linalg.svd(jacobian, compute_uv=False)[:, -1])
 
 
-def _why_not(q: Array, s: Array) -> str:
-    """Why a branch cannot carry the gun along the seam; empty if it can. q: (displacement, station, 6)."""
+class _Fit(NamedTuple):
+    """Why a branch cannot carry the gun along the seam, empty if it can; its smallest singular value."""
+
+    why: str
+    singular: float
+
+
+def _fit(q: Array, s: Array) -> _Fit:
+    """Judges one branch; q: (displacement, station, joint)."""
     missing = np.isnan(q).any(axis=(0, 2))
     if missing.any():
-        return f"the seam at {s[missing][0] * 1e3:.0f} mm is out of the arm's reach"
-    outside = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=(0, 2))
-    if outside.any():
-        return f"the seam at {s[outside][0] * 1e3:.0f} mm needs a joint beyond its limit"
-    jump = (np.abs(np.diff(q, axis=1)) > 1.0).any(axis=(0, 2))
+        return _Fit(f"the seam at {s[missing][0] * 1e3:.0f} mm is out of the arm's reach", 0.0)
+    jump = (np.abs(np.diff(q, axis=1)) > _JUMP_RAD).any(axis=(0, 2))
     if jump.any():
-        return f"the wrist would turn over at {s[1:][jump][0] * 1e3:.0f} mm"
+        return _Fit(f"the wrist would turn over at {s[1:][jump][0] * 1e3:.0f} mm along the seam", 0.0)
+    outside = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=0)
+    if outside.any():
+        station, joint = np.argwhere(outside)[0]
+        return _Fit(f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam", 0.0)
     smallest = _smallest_singular(q.reshape(-1, 6)).reshape(q.shape[:2]).min(axis=0)
     if smallest.min() < _MIN_SINGULAR:
-        return f"the arm is singular at {s[np.argmin(smallest)] * 1e3:.0f} mm"
-    return ""
+        return _Fit(f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam", 0.0)
+    return _Fit("", float(smallest.min()))
 
 
 def _touching(scene: Scene, q: Array, displaced: Array, s: Array) -> str:

@@ -143,7 +143,8 @@ def _add_solid(body: mujoco.MjsBody, spec: mujoco.MjSpec, k: int, solid: Solid) 
     elif solid.kind == "cylinder":
         body.add_geom(type=_G.mjGEOM_CYLINDER, size=solid.size, **common)
     else:
-        mesh = spec.add_mesh(name=f"solid_{k}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        # By its surface: thin pieces have hardly a volume (and a mocap body needs no inertia).
+        mesh = spec.add_mesh(name=f"solid_{k}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         mesh.uservert = solid.points.astype(np.float32).ravel()
         body.add_geom(type=_G.mjGEOM_MESH, meshname=f"solid_{k}", **common)
 

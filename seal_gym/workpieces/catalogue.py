@@ -25,16 +25,13 @@ def flat() -> Workpiece:
         The workpiece.
     """
     seam = build_seam([[-0.15, 0, 0], [0.15, 0, 0]], [0.0, -_LEAN, _LEAN])
-    lower, upper = (-0.20, -0.09), (0.20, 0.04)
+    plate, plate_solid = solids.plate((-0.20, -0.09), (0.20, 0.04), PLATE_THICKNESS_M, PLATE)
     wall = solids.prism(np.array([[-0.19, 0], [0.19, 0], [0.19, 0.008], [-0.19, 0.008]]), 0.0, 0.03, WALL)
     return Workpiece(
         name="flat",
         seam=seam,
-        surface=Surface.join(solids.rectangle(lower, upper, 0.0, PLATE), wall),
-        solids=(
-            solids.box((*lower, -PLATE_THICKNESS_M), (*upper, 0.0)),
-            solids.box((-0.19, 0.0, 0.0), (0.19, 0.008, 0.03)),
-        ),
+        surface=Surface.join(plate, wall),
+        solids=(plate_solid, solids.box((-0.19, 0.0, 0.0), (0.19, 0.008, 0.03))),
         pose=yaw_pose(0.35, 0.0, -0.05, np.pi / 2),
     )
 
@@ -60,18 +57,13 @@ def cylinder() -> Workpiece:
         run_in=chord * past_end,
         corners=np.empty((0, 2)),
     )
-    lower, upper = (-0.13, -0.15), (0.15, 0.15)
+    plate, plate_solid = solids.plate((-0.13, -0.15), (0.15, 0.15), PLATE_THICKNESS_M, PLATE)
     foot = solids.arc_points((0, 0), radius, 0.0, 2 * np.pi, _FACET)[:-1]
     return Workpiece(
         name="cylinder",
         seam=seam,
-        surface=Surface.join(
-            solids.rectangle(lower, upper, 0.0, PLATE), solids.prism(foot, 0.0, height, WALL)
-        ),
-        solids=(
-            solids.box((*lower, -PLATE_THICKNESS_M), (*upper, 0.0)),
-            solids.cylinder((0.0, 0.0), radius, 0.0, height),
-        ),
+        surface=Surface.join(plate, solids.prism(foot, 0.0, height, WALL)),
+        solids=(plate_solid, solids.cylinder((0.0, 0.0), radius, 0.0, height)),
         pose=yaw_pose(0.45, 0.0, -0.05, 0.0),
     )
 
@@ -96,16 +88,14 @@ def rectangular() -> Workpiece:
             for centre, first in corners
         ]
     )
-    lower, upper = (-0.115, -0.15), (0.14, 0.15)
+    plate, plate_solid = solids.plate((-0.115, -0.15), (0.14, 0.15), PLATE_THICKNESS_M, PLATE)
     return Workpiece(
         name="rectangular",
         seam=build_seam(vertices, approach, corner_radius=r),
-        surface=Surface.join(
-            solids.rectangle(lower, upper, 0.0, PLATE), solids.prism(foot, 0.0, height, WALL)
-        ),
+        surface=Surface.join(plate, solids.prism(foot, 0.0, height, WALL)),
         # A plain box would stand 2 mm proud of the rounded corners.
         solids=(
-            solids.box((*lower, -PLATE_THICKNESS_M), (*upper, 0.0)),
+            plate_solid,
             solids.box((x0 + r, -y, 0.0), (x1 - r, y, height)),
             solids.box((x0, -y + r, 0.0), (x1, y - r, height)),
             *(solids.cylinder(centre, r, 0.0, height) for centre, _ in corners),

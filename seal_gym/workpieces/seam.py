@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from seal_gym.core.errors import SeamError, require
 from seal_gym.core.frames import Array, cross, normalise
@@ -17,15 +17,20 @@ _SMOOTH_TURN_RAD = 1e-9
 _ARC_STEP_RAD = np.deg2rad(0.5)
 # The chord of an arc departs from it by R (1 - cos(step / 2)): 0.7 um at 70 mm.
 MIN_SPACING_M = 1e-4
+# Twice the arm's reach: beyond it a coordinate is no doubt in millimetres.
+MAX_COORDINATE_M = 2.0
 # Below this inner radius the mouth (radius 1.5 mm, 2.1 mm beside the seam) would turn on the spot.
 MIN_CORNER_RADIUS_M = 4e-3
 # The four ROI features cannot see the lean (rotation about y): a controller can only hold it.
 MAX_LEAN_RATE_RAD_M = np.deg2rad(300.0)
 MAX_LEAN_CHANGE_RAD = np.deg2rad(10.0)
+# What is nearer to the direction of travel leaves the lean undefined.
+MIN_CROSSING_RAD = np.deg2rad(30.0)
 # Under 30 deg the nozzle's mouth is within 0.2 mm of the wall, beyond 60 deg of the plate.
 FILLET_LEAN_RAD = (np.deg2rad(30.0), np.deg2rad(60.0))
 # The seam runs on past both ends of the sealed stretch, or the ROIs would see its end.
 RUN_ON_M = 0.03
+_SELF_CLEARANCE_M = 2e-3
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -69,6 +74,17 @@ class Seam:
         steps = np.linalg.norm(np.diff(self.position, axis=0), axis=1)
         arc = np.concatenate(([0.0], np.cumsum(steps))) - self.run_in
         object.__setattr__(self, "arc", arc)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the sealed stretch ends where it begins."""
+        ends = self.at([0.0, self.length]).position
+        return bool(np.linalg.norm(ends[1] - ends[0]) < MIN_SPACING_M)
+
+    @property
+    def up(self) -> Array:
+        """Unit normals of the floor at the samples: across the seam, in its vertical plane, shape (m, 3)."""
+        return cross(normalise(cross(self.tangent, _UP)), self.tangent)
 
     def at(self, s: ArrayLike) -> SeamPoint:
         """The seam at an arc length.
@@ -127,6 +143,43 @@ def nearest_on_path(  # noqa: D103  # documented where it is used; numba kernels
     return np.sqrt(best), best_s
 
 
+@kernel
+def _seam_in_world(
+    s: Array, arc: Array, position: Array, tangent: Array, part: Array, point: Array, direction: Array
+) -> None:
+    last = arc.shape[0] - 2
+    for i in range(s.shape[0]):
+        at = min(max(s[i], arc[0]), arc[-1])
+        k = min(max(np.searchsorted(arc, at, side="right") - 1, 0), last)
+        w = (at - arc[k]) / (arc[k + 1] - arc[k])
+        for r in range(3):
+            point[i, r], direction[i, r] = part[i, r, 3], 0.0
+            for m in range(3):
+                point[i, r] += part[i, r, m] * ((1.0 - w) * position[k, m] + w * position[k + 1, m])
+                direction[i, r] += part[i, r, m] * ((1.0 - w) * tangent[k, m] + w * tangent[k + 1, m])
+
+
+def seam_in_world(seam: Seam, s: Array, part_pose: Array) -> tuple[Array, Array]:
+    """Points of a seam on N displaced parts: what ``Seam.at`` gives, fast and in the world frame.
+
+    Args:
+        seam: The seam.
+        s: Arc lengths, shape (N,), m; clipped to the curve.
+        part_pose: ``T_world_part``, shape (N, 4, 4), m.
+
+    Returns:
+        Positions [m] and directions of travel (of about unit length), shape (N, 3) each.
+    """
+    point, direction = np.empty((len(s), 3)), np.empty((len(s), 3))
+    _seam_in_world(s, seam.arc, seam.position, seam.tangent, part_pose, point, direction)
+    return point, direction
+
+
+def _first(bad: NDArray[np.bool_]) -> int | None:
+    """Index of the first true element."""
+    return int(np.argmax(bad)) if bad.any() else None
+
+
 def _check_points(points: ArrayLike, approach: ArrayLike) -> tuple[Array, Array]:
     p, a = np.array(points, dtype=np.float64), np.array(approach, dtype=np.float64)
     require(
@@ -142,46 +195,67 @@ def _check_points(points: ArrayLike, approach: ArrayLike) -> tuple[Array, Array]
         SeamError,
     )
     for name, values in (("points", p), ("approach", a)):
-        bad = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+        k = _first(~np.all(np.isfinite(values), axis=1))
         require(
-            not len(bad), f"{name}[{bad[:1]}] is not finite: give numbers in m, no NaN or inf", SeamError
+            k is None,
+            f"{name}[{k}] = {values[k].tolist() if k is not None else ''} is not finite: every number must be, "
+            "no NaN or inf",
+            SeamError,
         )
-    size = np.linalg.norm(a, axis=1)
-    bad = np.flatnonzero(np.abs(size - 1.0) > 1e-3)
+    k = _first(np.abs(p).max(axis=1) > MAX_COORDINATE_M)
     require(
-        not len(bad),
-        f"approach[{bad[:1]}] has length {size[bad[:1]]}: must be a unit vector",
+        k is None,
+        f"points[{k}] = {p[k or 0].tolist()}: no coordinate may be beyond {MAX_COORDINATE_M:g} m; divide "
+        "millimetres by 1000",
+        SeamError,
+    )
+    size = np.linalg.norm(a, axis=1)
+    k = _first(np.abs(size - 1.0) > 1e-3)
+    require(
+        k is None,
+        f"approach[{k}] = {a[k or 0].tolist()} has length {size[k or 0]:.4g}: must be a unit vector; divide it "
+        "by its length",
         SeamError,
     )
     gap = np.linalg.norm(np.diff(p, axis=0), axis=1)
-    bad = np.flatnonzero(gap < MIN_SPACING_M)
+    k = _first(gap < MIN_SPACING_M)
     require(
-        not len(bad),
-        f"points {bad[:1]} and {bad[:1] + 1} are {gap[bad[:1]] * 1e3} mm apart: two points alike; keep "
-        f"neighbours at least {MIN_SPACING_M * 1e3} mm apart",
+        k is None,
+        f"points {k} and {(k or 0) + 1} are {gap[k or 0] * 1e3:.3g} mm apart: two points alike; keep neighbours "
+        f"at least {MIN_SPACING_M * 1e3:g} mm apart, drop one of them",
         SeamError,
     )
     return p, a / size[:, None]
 
 
-def _segments_cross(p: Array, clearance_m: float) -> tuple[int, int] | None:
-    """First pair of non-neighbouring segments that come closer than the clearance in the plate's plane."""
-    a, d = p[:-1, :2], np.diff(p[:, :2], axis=0)
-    n = len(a)
+def _segments_cross(p: Array, clearance_m: float, closed: bool) -> tuple[int, int] | None:
+    """First pair of segments, not neighbours, that cross or come too close in the plate's plane."""
+    start, d = p[:-1, :2], np.diff(p[:, :2], axis=0)
+    end, n = p[1:, :2], len(p) - 1
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
+
+    def to_segment(points: Array, k: Array | int) -> Array:
+        r, along = points - start[k], d[k]
+        square = np.maximum(np.sum(along**2, axis=-1), 1e-18)
+        w = np.clip(np.sum(r * along, axis=-1) / square, 0.0, 1.0)
+        return np.asarray(np.linalg.norm(r - w[..., None] * along, axis=-1))
+
     for i in range(n - 2):
-        j = np.arange(i + 2, n)
-        r = a[j] - a[i]
+        j = np.arange(i + 2, n - 1 if closed and i == 0 else n)
+        r = start[j] - start[i]
         det = d[i, 0] * d[j, 1] - d[i, 1] * d[j, 0]
         safe = np.where(np.abs(det) < 1e-15, 1.0, det)
         u = (r[:, 0] * d[j, 1] - r[:, 1] * d[j, 0]) / safe
         v = (r[:, 0] * d[i, 1] - r[:, 1] * d[i, 0]) / safe
         hit = (np.abs(det) >= 1e-15) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-        # Vertices against segment i, and segment i's start against the others: parallel overlaps too.
-        w = np.clip(np.sum(-r * d[j], axis=1) / np.maximum(np.sum(d[j] ** 2, axis=1), 1e-18), 0.0, 1.0)
-        near = np.linalg.norm(r + w[:, None] * d[j], axis=1) < clearance_m
-        far = arc[j] - arc[i] > np.pi * clearance_m
-        bad = np.flatnonzero(hit | (near & far))
+        # Where two segments do not cross, they are nearest at an end of one of them.
+        ends = (to_segment(start[i], j), to_segment(end[i], j), to_segment(start[j], i), to_segment(end[j], i))
+        near = np.min(ends, axis=0) < clearance_m
+        # Along a bend neighbours come close as well: only what lies more than half a turn away counts.
+        apart = arc[j] - arc[i + 1]
+        if closed:
+            apart = np.minimum(apart, arc[-1] - arc[j + 1] + arc[i])
+        bad = np.flatnonzero(hit | (near & (apart > np.pi * clearance_m)))
         if len(bad):
             return i, int(j[bad[0]])
     return None
@@ -205,14 +279,13 @@ class _Piece(NamedTuple):
     corner: bool
 
 
-def _round(p: Array, corner_radius: float) -> tuple[list[_Piece], float]:
-    """Replaces every turning vertex by an arc; returns the pieces in order and the smallest radius."""
+def _round(p: Array, corner_radius: float, n_head: int) -> list[_Piece]:
+    """Replaces every turning vertex by an arc; ``n_head`` vertices stand before the user's first point."""
     d = np.diff(p, axis=0)
     length = np.linalg.norm(d, axis=1)
     u = d / length[:, None]
     turn = np.arctan2(np.linalg.norm(cross(u[:-1], u[1:]), axis=1), np.sum(u[:-1] * u[1:], axis=1))
     pieces = [_Piece(p[:1], False)]
-    smallest = np.inf
     for k, angle in enumerate(turn, start=1):
         if angle < _SMOOTH_TURN_RAD:
             pieces.append(_Piece(p[k : k + 1], False))
@@ -222,14 +295,14 @@ def _round(p: Array, corner_radius: float) -> tuple[list[_Piece], float]:
             room = 0.5 * min(length[k - 1], length[k]) / np.tan(min(angle, np.pi - 1e-6) / 2)
             require(
                 corner_radius >= MIN_CORNER_RADIUS_M,
-                f"corner_radius = {corner_radius * 1e3:g} mm at point {k}, which turns "
+                f"corner_radius = {corner_radius * 1e3:g} mm at point {k - n_head}, which turns "
                 f"{np.rad2deg(angle):.1f} deg: tighter than the nozzle allows; use at least "
                 f"{MIN_CORNER_RADIUS_M * 1e3:g} mm",
                 SeamError,
             )
             require(
                 corner_radius <= room + 1e-12,
-                f"corner_radius = {corner_radius * 1e3:g} mm does not fit at point {k}, which turns "
+                f"corner_radius = {corner_radius * 1e3:g} mm does not fit at point {k - n_head}, which turns "
                 f"{np.rad2deg(angle):.1f} deg between sides of {length[k - 1] * 1e3:.1f} and "
                 f"{length[k] * 1e3:.1f} mm: at most {room * 1e3:.2f} mm there; lengthen the sides, reduce "
                 "the radius, or give more points along the curve",
@@ -238,14 +311,13 @@ def _round(p: Array, corner_radius: float) -> tuple[list[_Piece], float]:
         arc, r = _round_vertex(p[k - 1], p[k], p[k + 1], corner_radius if corner else None)
         require(
             r >= MIN_CORNER_RADIUS_M - 1e-12,
-            f"the curve at point {k} has a radius of {r * 1e3:.2f} mm: tighter than the nozzle allows; keep "
+            f"the curve at point {k - n_head} has a radius of {r * 1e3:.2f} mm: tighter than the nozzle allows; keep "
             f"it at {MIN_CORNER_RADIUS_M * 1e3:g} mm or more",
             SeamError,
         )
-        smallest = min(smallest, r)
         pieces.append(_Piece(arc, corner))
     pieces.append(_Piece(p[-1:], False))
-    return pieces, smallest
+    return pieces
 
 
 def _lean(p: Array, a: Array) -> tuple[Array, float]:
@@ -253,21 +325,40 @@ def _lean(p: Array, a: Array) -> tuple[Array, float]:
 
     The side is +1 for right of travel, -1 for left.
     """
-    d = np.diff(p, axis=0)
-    u = normalise(d)
-    tangent = np.concatenate((u[:1], u[:-1] + u[1:], u[-1:]))
-    right = cross(tangent, _UP)
-    across = np.sum(a * right, axis=1) / np.maximum(np.linalg.norm(right, axis=1), 1e-12)
-    lean = np.arccos(np.clip(a[:, 2], -1.0, 1.0))
-    sides = np.sign(across[lean > 1e-3])
+    u = normalise(np.diff(p, axis=0))
+    middle = u[:-1] + u[1:]
+    k = _first(np.linalg.norm(middle, axis=1) < 1e-3)
     require(
-        not len(sides) or bool(np.all(sides == sides[0])),
-        f"approach leans to the right of travel at some points and to the left at others (points "
-        f"{np.flatnonzero(np.sign(across) != (sides[0] if len(sides) else 1))[:3]}): the wall would change sides; "
-        "keep it on one side",
+        k is None, f"the polyline turns back on itself at point {(k or 0) + 1}: a seam must go on", SeamError
+    )
+    tangent = normalise(np.concatenate((u[:1], middle, u[-1:])))
+    right = normalise(cross(tangent, _UP))
+    k = _first(np.abs(np.sum(a * tangent, axis=1)) > np.cos(MIN_CROSSING_RAD))
+    require(
+        k is None,
+        f"approach[{k}] = {a[k or 0].tolist()} is parallel to the seam, or within "
+        f"{np.rad2deg(MIN_CROSSING_RAD):.0f} deg of it: it must point away from the surface, across the seam",
         SeamError,
     )
-    return lean, float(sides[0]) if len(sides) and sides[0] != 0 else 1.0
+    # From the floor's normal, which a rising seam tilts back.
+    lean = np.arccos(np.clip(np.sum(a * cross(right, tangent), axis=1), -1.0, 1.0))
+    sides = np.where(lean > 1e-3, np.sign(np.sum(a * right, axis=1)), 0.0)
+    given = sides[sides != 0]
+    side = float(given[0]) if len(given) else 1.0
+    k = _first(sides == -side)
+    require(
+        k is None,
+        f"approach leans to the {'right' if side > 0 else 'left'} of travel at first and to the other side at "
+        f"point {k}: the wall would change sides; keep it on one side",
+        SeamError,
+    )
+    return lean, side
+
+
+def _stretches(pair: tuple[int, int] | None, points: int) -> str:
+    """Names of two segments, counted from the polyline's first."""
+    names = {-1: "the run-on before the first point", points - 1: "the run-on past the last point"}
+    return " and ".join(names.get(k, f"segment {k}") for k in pair or ())
 
 
 def build_seam(
@@ -311,21 +402,23 @@ def build_seam(
     closed = len(p) > 3 and bool(np.linalg.norm(p[0] - p[-1]) < MIN_SPACING_M)
     if closed:
         head, tail = _along(p[::-1], run_on_m)[::-1], _along(p, run_on_m)
-        crossed = _segments_cross(p[:-1], 2e-3)
+        crossed = _segments_cross(p, _SELF_CLEARANCE_M, closed)
     else:
         head = (p[0] - run_on_m * normalise(p[1] - p[0]))[None]
         tail = (p[-1] + run_on_m * normalise(p[-1] - p[-2]))[None]
-        crossed = _segments_cross(p, 2e-3)
+        crossed = _segments_cross(np.concatenate((head, p, tail)), _SELF_CLEARANCE_M, closed)
+        crossed = crossed and (crossed[0] - 1, crossed[1] - 1)
     require(
         crossed is None,
-        f"segments {crossed} of the polyline cross or come within 2 mm of each other: a seam must not "
-        "cross itself",
+        f"{_stretches(crossed, len(p))} of the polyline cross or come within "
+        f"{_SELF_CLEARANCE_M * 1e3:g} mm of each other: a seam must not cross itself; it runs on straight for "
+        f"{run_on_m * 1e3:g} mm past both ends, so that the cameras do not see its end",
         SeamError,
     )
     n_head = len(head)
     extended = np.concatenate((head, p, tail))
     extended_lean = np.concatenate((np.full(n_head, lean[0]), lean, np.full(len(tail), lean[-1])))
-    pieces, _ = _round(extended, corner_radius)
+    pieces = _round(extended, corner_radius, n_head)
     position = np.concatenate([piece.points for piece in pieces])
     which = np.repeat(np.arange(len(pieces)), [len(piece.points) for piece in pieces])
     keep = np.concatenate(([True], np.linalg.norm(np.diff(position, axis=0), axis=1) > 1e-9))
@@ -355,16 +448,9 @@ def build_seam(
 
 
 def _along(p: Array, distance: float) -> Array:
-    """Vertices of a closed polyline after its first, up to a distance, the last one cut to it."""
-    out, left = [], distance
-    for a, b in zip(p[:-1], p[1:], strict=True):
-        step = float(np.linalg.norm(b - a))
-        if step >= left:
-            out.append(a + (b - a) * left / step)
-            break
-        out.append(b)
-        left -= step
-    return np.array(out)
+    """Vertices of a closed polyline after its first, up to the first that lies beyond a distance."""
+    arc = np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))
+    return p[1 : 2 + min(int(np.searchsorted(arc, distance)), len(arc) - 1)]
 
 
 def _tangents(position: Array, pieces: list[_Piece], which: Array) -> Array:

@@ -1,15 +1,12 @@
-"""Surfaces and collision solids swept along seams or read from mesh files."""
+"""Surfaces and collision solids swept along seams."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from seal_gym.core.errors import SeamError, require
 from seal_gym.core.frames import Array, cross, normalise, transform
 from seal_gym.workpieces.surface import Surface
 
@@ -18,23 +15,23 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """A convex body (or, for ``mesh``, a triangle shell) that gun and arm can hit.
+    """A convex body that gun and arm can hit.
 
     Attributes:
-        kind: ``box`` (size = half extents), ``cylinder`` (size = radius, half height, 0), ``hull`` (convex
-            hull of ``points``) or ``mesh`` (``points`` are triangle corners in threes).
+        kind: ``box`` (size = half extents), ``cylinder`` (size = radius, half height, 0) or ``hull`` (convex
+            hull of ``points``).
         pose: ``T_part_solid``, shape (4, 4), m.
-        size: Shape (3,), m; zeros for hull and mesh.
+        size: Shape (3,), m; zeros for a hull.
         points: Shape (n, 3), m, in the solid's frame; empty for box and cylinder.
     """
 
-    kind: Literal["box", "cylinder", "hull", "mesh"]
+    kind: Literal["box", "cylinder", "hull"]
     pose: Array
     size: Array
     points: Array
 
 
-def _solid(kind: Literal["box", "cylinder", "hull", "mesh"], position: Array, size: Array) -> Solid:
+def _solid(kind: Literal["box", "cylinder"], position: Array, size: Array) -> Solid:
     return Solid(kind=kind, pose=transform(np.eye(3), position), size=size, points=np.empty((0, 3)))
 
 
@@ -95,6 +92,24 @@ def _strip(a: Array, b: Array) -> Array:
     return triangles[area > 1e-14]
 
 
+def _end_caps(rails: tuple[Array, Array, Array, Array], *, forward: bool) -> Array:
+    """Triangles that close both ends of a swept section.
+
+    Args:
+        rails: Corners of the section along the sweep, each of shape (m, 3), m.
+        forward: Whether they go round counter-clockwise seen from past the sweep's end.
+
+    Returns:
+        Shape (4, 3, 3), m.
+    """
+    caps = []
+    for k, at_end in ((0, False), (-1, True)):
+        quad = np.stack([rail[k] for rail in rails])
+        quad = quad if at_end == forward else quad[::-1]
+        caps += [quad[[0, 1, 2]], quad[[0, 2, 3]]]
+    return np.stack(caps)
+
+
 def rectangle(lower: tuple[float, float], upper: tuple[float, float], z: float, material: int) -> Surface:
     """Horizontal rectangle seen from above.
 
@@ -110,6 +125,43 @@ def rectangle(lower: tuple[float, float], upper: tuple[float, float], z: float, 
     (x0, y0), (x1, y1) = lower, upper
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
     return _surface(corners[[[0, 1, 2], [0, 2, 3]]], material)
+
+
+def plate(
+    lower: tuple[float, float], upper: tuple[float, float], thickness: float, material: int
+) -> tuple[Surface, Solid]:
+    """A rectangular plate whose top is the plane z = 0.
+
+    Args:
+        lower: Smallest x, y [m].
+        upper: Largest x, y [m].
+        thickness: Downwards [m].
+        material: Index into ``MATERIALS``.
+
+    Returns:
+        Its top and sides, and its solid.
+    """
+    return (
+        Surface.join(rectangle(lower, upper, 0.0, material), rim(lower, upper, thickness, material)),
+        box((*lower, -thickness), (*upper, 0.0)),
+    )
+
+
+def rim(lower: tuple[float, float], upper: tuple[float, float], thickness: float, material: int) -> Surface:
+    """The sides of a plate: without them it would seem to float above its own shadow.
+
+    Args:
+        lower: Smallest x, y [m].
+        upper: Largest x, y [m].
+        thickness: From z = 0 downwards [m].
+        material: Index into ``MATERIALS``.
+
+    Returns:
+        Eight triangles.
+    """
+    (x0, y0), (x1, y1) = lower, upper
+    top = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0], [x0, y0, 0.0]])
+    return _surface(_strip(top, top - thickness * _UP), material)
 
 
 def prism(footprint: Array, bottom: float, top: float, material: int) -> Surface:
@@ -196,17 +248,13 @@ def sweep_wall(
     right_hand = float(np.sum(cross(tangent, _UP) * outward[:-1])) > 0
     bands = [(face_high, face_low), (back_high, face_high), (back_foot, back_high)]
     triangles = np.concatenate([_strip(*(band if right_hand else band[::-1])) for band in bands])
-    ends = []
-    for k, forward in ((0, False), (-1, True)):
-        quad = np.stack((face_low[k], face_high[k], back_high[k], back_foot[k]))
-        quad = quad if forward == right_hand else quad[::-1]
-        ends += [quad[[0, 1, 2]], quad[[0, 2, 3]]]
+    ends = _end_caps((face_low, face_high, back_high, back_foot), forward=right_hand)
     pieces = []
     index = simplify(curve, 5e-5)
     for a, b in zip(index[:-1], index[1:], strict=True):
         corners = [face_low[[a, b]] * [1, 1, 0], face_high[[a, b]], back_foot[[a, b]], back_high[[a, b]]]
         pieces.append(hull(np.concatenate(corners)))
-    return _surface(np.concatenate((triangles, np.stack(ends))), material), pieces
+    return _surface(np.concatenate((triangles, ends)), material), pieces
 
 
 def sweep_ledge(
@@ -229,6 +277,8 @@ def sweep_ledge(
     right_hand = float(np.sum(cross(tangent, _UP) * outward[:-1])) > 0
     bands = [(inner, outer), (outer, outer_foot)]
     triangles = np.concatenate([_strip(*(band if right_hand else band[::-1])) for band in bands])
+    ends = _end_caps((inner_foot, inner, outer, outer_foot), forward=not right_hand)
+    triangles = np.concatenate((triangles, ends))
     index = simplify(curve, 5e-5)
     pieces = [
         hull(np.concatenate([rail[[a, b]] for rail in (inner, outer, inner_foot - 1e-3 * _UP, outer_foot)]))
@@ -258,6 +308,9 @@ def groove_plate(
     s = np.linspace(0.0, arc[-1], int(np.ceil(arc[-1] / (0.6 * half_width))) + 1)
     centre = np.column_stack([np.interp(s, arc, curve[:, k]) for k in range(3)])
     side = normalise(np.column_stack([np.interp(s, arc, right[:, k]) for k in range(3)]))
+    closed = bool(np.linalg.norm(curve[-1] - curve[0]) < half_width)
+    if closed:
+        centre[-1], side[-1] = centre[0], side[0]
     left_bank, right_bank = centre - half_width * side, centre + half_width * side
     lower = tuple(float(v) for v in centre[:, :2].min(axis=0) - margin)
     upper = tuple(float(v) for v in centre[:, :2].max(axis=0) + margin)
@@ -266,17 +319,20 @@ def groove_plate(
     ).reshape(-1, 2)
     gap = np.min(np.linalg.norm(grid[:, None] - centre[None, ::5, :2], axis=-1), axis=1)
     grid = grid[gap > 4 * half_width]
-    n = len(centre)
-    points = np.concatenate((left_bank[:, :2], right_bank[:, :2], grid))
+    n = len(centre) - closed
+    points = np.concatenate((left_bank[:n, :2], right_bank[:n, :2], grid))
     simplices = Delaunay(points).simplices
-    corners = points[simplices]
-    turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    first, second = (points[simplices[:, k]] - points[simplices[:, 0]] for k in (1, 2))
+    turn = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     simplices = np.where(turn[:, None] > 0, simplices, simplices[:, ::-1])
     # Inside the groove: all three corners on the banks, not all on the same one, close along the arc.
     station = np.where(simplices < n, simplices, simplices - n)
     on_banks = np.all(simplices < 2 * n, axis=1)
     both = on_banks & np.any(simplices < n, axis=1) & np.any(simplices >= n, axis=1)
-    inside = both & (np.ptp(station, axis=1) <= 3)
+    apart = np.abs(station - np.roll(station, 1, axis=1))
+    if closed:
+        apart = np.minimum(apart, n - apart)
+    inside = both & np.all(apart <= 3, axis=1)
     flat = np.column_stack((points, np.zeros(len(points))))
     top = flat[simplices[~inside]]
     down = depth * _UP
@@ -289,37 +345,3 @@ def groove_plate(
     )
     surface = Surface.join(_surface(top, materials[0]), _surface(channel, materials[1]))
     return surface, (lower[0], lower[1]), (upper[0], upper[1])
-
-
-def read_mesh(path: Path, scale: float) -> Array:
-    """Triangles of an STL or OBJ file.
-
-    Args:
-        path: The file.
-        scale: Metres per unit of the file.
-
-    Returns:
-        Shape (n, 3, 3), m, in the file's frame.
-
-    Raises:
-        SeamError: If there is no such file, its type is another, or it holds no usable mesh.
-    """
-    require(path.is_file(), f"mesh file {str(path)!r} not found: give the path of an STL or OBJ file", SeamError)
-    require(
-        path.suffix.lower() in (".stl", ".obj"),
-        f"mesh file {path.name!r} has the type {path.suffix!r}: must be .stl or .obj",
-        SeamError,
-    )
-    spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="part", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    mesh.file = str(path.resolve())
-    mesh.scale = [scale] * 3
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part")
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise SeamError(f"mesh file {path.name!r} cannot be used: {error}") from error
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
-    vertices = model.mesh_vert.astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[0]
-    return np.asarray(vertices[model.mesh_face])

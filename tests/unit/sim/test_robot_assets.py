@@ -315,6 +315,23 @@ def test_camera_housing_stands_behind_its_optical_centre(armed, view):
     np.testing.assert_allclose(backward, -axis, rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("view", ["front", "side"])
+def test_nothing_but_the_nozzle_stands_in_a_cameras_view(armed, view):
+    data, camera = at(armed, START["flat"]), getattr(load_cell(), view)
+    tip = site_pose(data, "gun/tip")
+    eye = tip[:3, :3] @ camera.position_m + tip[:3, 3]
+    seen, hit = set(), np.empty(1, np.int32)
+    slopes = np.tan(np.radians(8.0)) * np.linspace(-1, 1, 41)
+    for x, y in np.stack(np.meshgrid(slopes, slopes), axis=-1).reshape(-1, 2):
+        ray = tip[:3, :3] @ camera.rotation @ np.array([x, y, 1.0])
+        if mujoco.mj_ray(armed, data, eye, ray, None, 1, -1, hit) >= 0:
+            seen.add(int(hit[0]))
+    # The region of interest lies within 8 deg of the axis, and the nozzle is all there is between.
+    nozzle = armed.geom("gun/col_nozzle").dataid[0]
+    assert seen
+    assert all(armed.geom_dataid[g] == nozzle for g in seen), seen
+
+
 # --- contacts with itself ---
 
 

@@ -1,0 +1,7 @@
+"""All speed figures: ``python -m tests.benchmarks`` (the soak runs apart: ``python -m tests.benchmarks.soak``)."""
+
+from tests.benchmarks import bench_envs, bench_raycast, bench_rmp
+
+for bench in (bench_rmp, bench_raycast, bench_envs):
+    print(f"\n{bench.__doc__.splitlines()[0]}")
+    bench.main()
