@@ -37,7 +37,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m experiments.demo", description=__doc__.splitlines()[0])
     parser.add_argument("--policy", default="rmp_expert", choices=sorted(agents.POLICIES))
     parser.add_argument(
-        "--workpiece", action="append", choices=NAMES, help="a nominal part; may be repeated (default: all three)"
+        "--workpiece",
+        action="append",
+        choices=NAMES,
+        help="a nominal part; may be repeated (default: all three)",
     )
     parser.add_argument(
         "--seam", type=Path, help="a seam of yours: CSV with rows x,y,z,ax,ay,az in m (default: an S-curve)"
@@ -118,7 +121,9 @@ def main(arguments: list[str] | None = None) -> int:
             for name in chosen
             for k in range(options.trials)
         ]
-        rows = trials.run_all(wanted, jobs=options.jobs, log=options.out / "demo.trials.jsonl", title="sealing")
+        rows = trials.run_all(
+            wanted, jobs=options.jobs, log=options.out / "demo.trials.jsonl", title="sealing"
+        )
         summary = results.summarise(rows)
         renderer = options.renderer if options.perception == "vision" else "none"
         results.write(options.out, "demo", summary, rows, renderer=renderer, regime="static")

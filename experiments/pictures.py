@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from seal_gym.envs.seal_env import SealEnv
 
 mpl.use("Agg")  # no screen needed
-import matplotlib.pyplot as plt  # noqa: E402  # the backend has to be chosen first
+import matplotlib.pyplot as plt  # the backend has to be chosen first
 
 SPEED_UP = 5
 _STRIP = 176
@@ -83,7 +83,9 @@ class Recorder:
 
         for error, label in ((1e-3, "0.001"), (1e-2, "0.01"), (0.1, "0.1"), (1.0, "1"), (10.0, "10 mm")):
             cv2.line(strip, (left, row(error)), (right, row(error)), _GRID, 1)
-            cv2.putText(strip, label, (12, row(error) + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA)
+            cv2.putText(
+                strip, label, (12, row(error) + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA
+            )
         span = max(1.15 * self._nominal_s, self.time_s[-1])
         x = left + (right - left) * np.asarray(self.time_s) / span
         points = np.column_stack((x.round(), [row(e) for e in self.error_mm])).astype(np.int32)
@@ -131,10 +133,20 @@ class Recorder:
         side.set(xlabel="along the seam [mm]", ylabel="z of the part [mm]", title="from the side")
         side.legend(loc="best", fontsize=9)
 
-        error.semilogy(np.asarray(self.s_mm)[sealing], np.maximum(np.asarray(self.error_mm)[sealing], 1e-4), color=_RED)
+        error.semilogy(
+            np.asarray(self.s_mm)[sealing], np.maximum(np.asarray(self.error_mm)[sealing], 1e-4), color=_RED
+        )
         error.axhline(1.06, color=_GREY, ls="--", lw=1)
-        error.text(0.995, 1.06, "nozzle clearance 1.06 mm", color=_GREY, fontsize=8, ha="right", va="bottom",
-                   transform=error.get_yaxis_transform())
+        error.text(
+            0.995,
+            1.06,
+            "nozzle clearance 1.06 mm",
+            color=_GREY,
+            fontsize=8,
+            ha="right",
+            va="bottom",
+            transform=error.get_yaxis_transform(),
+        )
         error.set(xlabel="along the seam [mm]", ylabel="tip error [mm]", title="tip error")
         for axes in (top, side, error):
             axes.grid(color="#dddddd", lw=0.6)

@@ -14,7 +14,17 @@ from scipy import stats
 
 import seal_gym
 
-_STACK = ("python", "seal-gym", "gymnasium", "mujoco", "numpy", "numba", "scipy", "torch", "stable-baselines3")
+_STACK = (
+    "python",
+    "seal-gym",
+    "gymnasium",
+    "mujoco",
+    "numpy",
+    "numba",
+    "scipy",
+    "torch",
+    "stable-baselines3",
+)
 _BOOTSTRAPS = 2000
 
 
@@ -119,7 +129,13 @@ def _commit() -> str | None:
 
 
 def write(
-    out: Path, name: str, rows: list[dict[str, Any]], trials: list[dict[str, Any]], *, renderer: str, regime: str
+    out: Path,
+    name: str,
+    rows: list[dict[str, Any]],
+    trials: list[dict[str, Any]],
+    *,
+    renderer: str,
+    regime: str,
 ) -> None:
     """Writes ``<name>.json``, ``.csv`` and ``.md``.
 
@@ -171,7 +187,17 @@ def table(rows: list[dict[str, Any]], *, markdown: bool = False) -> str:
     Returns:
         Text.
     """
-    head = ["method", "workpiece", "trials", "reached %", "collision %", "timeout %", "RMSE mm", "coverage %", "time s"]
+    head = [
+        "method",
+        "workpiece",
+        "trials",
+        "reached %",
+        "collision %",
+        "timeout %",
+        "RMSE mm",
+        "coverage %",
+        "time s",
+    ]
     body = [
         [
             row["method"],

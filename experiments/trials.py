@@ -5,7 +5,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,9 @@ def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
     direction = table[:, 3:]
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     # A file has few digits: anything near a unit vector is meant as one.
-    direction = np.where(np.abs(length - 1.0) < 0.02, direction / np.where(length > 0, length, 1.0), direction)
+    direction = np.where(
+        np.abs(length - 1.0) < 0.02, direction / np.where(length > 0, length, 1.0), direction
+    )
     return table[:, :3], direction
 
 
@@ -183,7 +185,11 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
     missing = [t for t in wanted if _key(t.method, t.spec()) not in done]
     with log.open("a", encoding="utf-8") as file:
         for row in tqdm(
-            _results(missing, jobs), total=len(wanted), initial=len(wanted) - len(missing), desc=title, unit="trial"
+            _results(missing, jobs),
+            total=len(wanted),
+            initial=len(wanted) - len(missing),
+            desc=title,
+            unit="trial",
         ):
             done[_key(row["method"], row["env_spec"])] = row
             file.write(json.dumps(row) + "\n")

@@ -32,7 +32,7 @@ def _register() -> None:
 
 def __getattr__(name: str) -> Any:
     if name == "Workpiece":
-        from seal_gym.workpieces.workpiece import Workpiece  # noqa: PLC0415  # loads MuJoCo: on demand
+        from seal_gym.workpieces.workpiece import Workpiece  # loads MuJoCo: on demand
 
         return Workpiece
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

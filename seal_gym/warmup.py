@@ -1,6 +1,6 @@
 """Compiles the kernels and fills their cache on disk, so that the first environment starts at once.
 
-    python -m seal_gym.warmup
+python -m seal_gym.warmup
 """
 
 import numpy as np

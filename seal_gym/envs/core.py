@@ -142,9 +142,7 @@ class SealCore:
         features = spaces.Box(_LOWER.astype(np.float32), _BOUND.astype(np.float32), dtype=np.float32)
         if self.cfg.observation == "features":
             return features
-        images = {
-            c.name: spaces.Box(0, 255, (c.height, c.width, 3), np.uint8) for c in self.cfg.cell.cameras
-        }
+        images = {c.name: spaces.Box(0, 255, (c.height, c.width, 3), np.uint8) for c in self.cfg.cell.cameras}
         return spaces.Dict({"features": features, **images})
 
     # -- running ----------------------------------------------------------------------------------------
@@ -268,9 +266,7 @@ class SealCore:
         offset = self.tip.pose[:, :3, 3] - part[:, :3, 3]
         return np.ascontiguousarray((offset[:, None] @ part[:, :3, :3])[:, 0])
 
-    def _judge(
-        self, touched: NDArray[np.bool_], action: Array, before: Array, error: Array
-    ) -> StepResult:
+    def _judge(self, touched: NDArray[np.bool_], action: Array, before: Array, error: Array) -> StepResult:
         cell, progress = self.cfg.cell, self.progress
         reached = progress.reached & ~touched
         lost = progress.lost & ~touched

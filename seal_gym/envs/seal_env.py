@@ -157,9 +157,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         self._show()
         return observation, self.core.info(0, None)
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advances one camera frame.
 
         Args:

@@ -69,7 +69,7 @@ class Sensors:
     @cached_property
     def _renderer(self) -> _Renderer:
         if self._cfg.renderer == "gl":
-            from seal_gym.sim.gl import GlSensors  # noqa: PLC0415  # needs OpenGL: only when asked for
+            from seal_gym.sim.gl import GlSensors  # needs OpenGL: only when asked for
 
             return GlSensors(self._scene)
         return Raycaster(self._scene.workpiece.surface, self._scene.cell, self._scene.tool)

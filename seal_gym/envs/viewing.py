@@ -123,7 +123,7 @@ class SceneView:
         return top + 28 + height
 
     def _shot(self, name: str, height: int, width: int, camera: mujoco.MjvCamera) -> NDArray[np.uint8]:
-        from seal_gym.sim.gl import offscreen  # noqa: PLC0415  # loads OpenGL: only for pictures
+        from seal_gym.sim.gl import offscreen  # loads OpenGL: only for pictures
 
         if name not in self._renderers:
             renderer = offscreen(self._core.scene.model, height, width)
@@ -186,7 +186,7 @@ class SceneView:
         """
         core = self._core
         if self._viewer is None:
-            import mujoco.viewer  # noqa: PLC0415  # loads GLFW: only with a screen
+            import mujoco.viewer  # loads GLFW: only with a screen
 
             self._viewer_data = mujoco.MjData(core.scene.model)
             try:

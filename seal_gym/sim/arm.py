@@ -102,9 +102,9 @@ class ArmBatch:
         t, a = self._t, acceleration[:, None]
         target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + t * a)
         try:
-            touched = self._batch.rollout(
-                target.shape[1], target, record=("ncon",), out=self._contact
-            )["ncon"]
+            touched = self._batch.rollout(target.shape[1], target, record=("ncon",), out=self._contact)[
+                "ncon"
+            ]
         except SimulationError as error:
             raise PhysicsError(f"MuJoCo stopped simulations {error.ids.tolist()}: {error}") from error
         self.q_command, self.qd_command = reached, speed
@@ -133,6 +133,4 @@ class ArmBatch:
             Pairs of geom names.
         """
         model = self.scene.model
-        return [
-            (model.geom(int(c.geom1)).name, model.geom(int(c.geom2)).name) for c in self.data(i).contact
-        ]
+        return [(model.geom(int(c.geom1)).name, model.geom(int(c.geom2)).name) for c in self.data(i).contact]

@@ -64,7 +64,8 @@ class GlSensors:
         self._option.geomgroup[[GROUP_FURNITURE, GROUP_COLLISION]] = 0
         self._option.sitegroup[:] = 0
         self._renderers = [
-            offscreen(scene.model, _SUPERSAMPLE * c.height, _SUPERSAMPLE * c.width) for c in scene.cell.cameras
+            offscreen(scene.model, _SUPERSAMPLE * c.height, _SUPERSAMPLE * c.width)
+            for c in scene.cell.cameras
         ]
         for renderer in self._renderers:
             for flag in ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX"):
@@ -108,8 +109,20 @@ class GlSensors:
         """Puts the gun's geoms and cameras where the tip is, whatever the arm's posture would be."""
         model, data = self._scene.model, self._data
         for ids, local_pos, local_quat, pos, mat in (
-            (np.flatnonzero(model.geom_bodyid == self._gun), model.geom_pos, model.geom_quat, data.geom_xpos, data.geom_xmat),
-            (np.flatnonzero(model.cam_bodyid == self._gun), model.cam_pos, model.cam_quat, data.cam_xpos, data.cam_xmat),
+            (
+                np.flatnonzero(model.geom_bodyid == self._gun),
+                model.geom_pos,
+                model.geom_quat,
+                data.geom_xpos,
+                data.geom_xmat,
+            ),
+            (
+                np.flatnonzero(model.cam_bodyid == self._gun),
+                model.cam_pos,
+                model.cam_quat,
+                data.cam_xpos,
+                data.cam_xmat,
+            ),
         ):
             rotation = np.empty(9)
             for k in ids:

@@ -11,7 +11,7 @@ from seal_gym.core.frames import Array
 from seal_gym.sim.texture import PERIOD_M
 
 Range = tuple[float, float]
-MAX_BLUR_PX = 8.0
+MAX_BLUR_PX = 6.0
 _DRAWS = 9
 
 

@@ -168,39 +168,40 @@ def _hidden(
 
 
 @kernel
-def _pixel_box(a: Array, b: Array, c: Array, ray_x: Array, ray_y: Array, focal: float, box: Ints) -> bool:
+def _pixel_box(p: Array, ray_x: Array, ray_y: Array, focal: float, box: Ints, m: int) -> bool:
     """Pixels that a triangle (camera frame) may touch; the whole ROI if a corner is beside the camera."""
     width, height = len(ray_x), len(ray_y)
-    box[0], box[1], box[2], box[3] = 0, width, 0, height
-    if min(a[2], b[2], c[2]) < _NEAR_M:
+    box[m, 0], box[m, 1], box[m, 2], box[m, 3] = 0, width, 0, height
+    if min(p[0, 2], min(p[1, 2], p[2, 2])) < _NEAR_M:  # noqa: PLW3301 - numba inlines two arguments
         return True
-    xa, xb, xc = a[0] / a[2], b[0] / b[2], c[0] / c[2]
-    ya, yb, yc = a[1] / a[2], b[1] / b[2], c[1] / c[2]
-    left, top, f = ray_x[0], ray_y[0], focal
+    xa, xb, xc = p[0, 0] / p[0, 2], p[1, 0] / p[1, 2], p[2, 0] / p[2, 2]
+    ya, yb, yc = p[0, 1] / p[0, 2], p[1, 1] / p[1, 2], p[2, 1] / p[2, 2]
+    left, top = ray_x[0], ray_y[0]
     # Clamped before the conversion to integers, which must not overflow.
-    box[0] = int(min(max((min(xa, xb, xc) - left) * f - 0.5, 0.0), width + 0.0))
-    box[1] = int(min(max((max(xa, xb, xc) - left) * f + 2.5, 0.0), width + 0.0))
-    box[2] = int(min(max((min(ya, yb, yc) - top) * f - 0.5, 0.0), height + 0.0))
-    box[3] = int(min(max((max(ya, yb, yc) - top) * f + 2.5, 0.0), height + 0.0))
-    return bool(box[0] < box[1] and box[2] < box[3])
+    box[m, 0] = int(min(max((min(xa, min(xb, xc)) - left) * focal - 0.5, 0.0), width + 0.0))  # noqa: PLW3301
+    box[m, 1] = int(min(max((max(xa, max(xb, xc)) - left) * focal + 2.5, 0.0), width + 0.0))  # noqa: PLW3301
+    box[m, 2] = int(min(max((min(ya, min(yb, yc)) - top) * focal - 0.5, 0.0), height + 0.0))  # noqa: PLW3301
+    box[m, 3] = int(min(max((max(ya, max(yb, yc)) - top) * focal + 2.5, 0.0), height + 0.0))  # noqa: PLW3301
+    return bool(box[m, 0] < box[m, 1] and box[m, 2] < box[m, 3])
 
 
 @kernel
-def _planes(a: Array, b: Array, c: Array, uv: Array, edge: Array, face: Array) -> bool:
+def _planes(p: Array, uv: Array, k: int, edge: Array, face: Array, m: int) -> bool:
     """Where the ray hits, as linear functions; exact opposites on a shared edge, so there are no cracks."""
-    for i in range(3):
-        p, q = (i + 1) % 3, (i + 2) % 3
-        edge[i] = c[p] * b[q] - c[q] * b[p]
-        edge[3 + i] = a[p] * c[q] - a[q] * c[p]
-        edge[6 + i] = b[p] * a[q] - b[q] * a[p]
-    volume = a[0] * edge[0] + a[1] * edge[1] + a[2] * edge[2]
+    for n in range(3):
+        a, b = (n + 2) % 3, (n + 1) % 3
+        edge[m, 3 * n] = p[a, 1] * p[b, 2] - p[a, 2] * p[b, 1]
+        edge[m, 3 * n + 1] = p[a, 2] * p[b, 0] - p[a, 0] * p[b, 2]
+        edge[m, 3 * n + 2] = p[a, 0] * p[b, 1] - p[a, 1] * p[b, 0]
+    volume = p[0, 0] * edge[m, 0] + p[0, 1] * edge[m, 1] + p[0, 2] * edge[m, 2]
     if volume <= 0.0:
         return False
+    share = 1.0 / volume
     for i in range(3):
-        face[i] = (edge[i] + edge[3 + i] + edge[6 + i]) / volume
-        for t in range(2):
-            mixed = uv[0, t] * edge[i] + uv[1, t] * edge[3 + i] + uv[2, t] * edge[6 + i]
-            face[3 + 3 * t + i] = mixed / volume
+        e0, e1, e2 = edge[m, i] * share, edge[m, 3 + i] * share, edge[m, 6 + i] * share
+        face[m, i] = e0 + e1 + e2
+        face[m, 3 + i] = uv[k, 0, 0] * e0 + uv[k, 1, 0] * e1 + uv[k, 2, 0] * e2
+        face[m, 6 + i] = uv[k, 0, 1] * e0 + uv[k, 1, 1] * e1 + uv[k, 2, 1] * e2
     return True
 
 
@@ -212,28 +213,30 @@ def _select(
     axis = np.empty(3)
     for i in range(3):
         axis[i] = rot[i, 0] * view.axis[0] + rot[i, 1] * view.axis[1] + rot[i, 2] * view.axis[2]
-    corner, plane, sphere, face = mesh.corner, mesh.plane, mesh.sphere, shown.face
+    corner, plane, sphere, uv = mesh.corner, mesh.plane, mesh.sphere, mesh.uv
+    edge, face, box, which = shown.edge, shown.face, shown.box, shown.which
+    albedo, material = mesh.albedo, mesh.material
+    ray_x, ray_y, focal, cone_cos, cone_sin = view.ray_x, view.ray_y, view.focal, view.cone_cos, view.cone_sin
     ambient, diffuse, strength = look.ambient[row], look.diffuse[row], look.texture[row]
     points = np.empty((3, 3))
     m = 0
     for k in range(len(corner)):
-        if _hidden(k, plane, sphere, axis, eye, view.cone_cos, view.cone_sin):
+        if _hidden(k, plane, sphere, axis, eye, cone_cos, cone_sin):
             continue
         for v in range(3):
             x, y, z = corner[k, v, 0] - eye[0], corner[k, v, 1] - eye[1], corner[k, v, 2] - eye[2]
             for i in range(3):
                 points[v, i] = rot[0, i] * x + rot[1, i] * y + rot[2, i] * z
-        a, b, c = points[0], points[1], points[2]
-        if not _pixel_box(a, b, c, view.ray_x, view.ray_y, view.focal, shown.box[m]):
+        if not _pixel_box(points, ray_x, ray_y, focal, box, m):
             continue
-        if not _planes(a, b, c, mesh.uv[k], shown.edge[m], face[m]):
+        if not _planes(points, uv, k, edge, face, m):
             continue
-        shown.which[m] = k
+        which[m] = k
         cosine = plane[k, 0] * lamp[0] + plane[k, 1] * lamp[1] + plane[k, 2] * lamp[2]
         light = ambient + diffuse * max(0.0, cosine)
         for i in range(3):
-            face[m, 9 + i] = mesh.albedo[mesh.material[k], i] * light
-        face[m, 12] = mesh.albedo[mesh.material[k], 3] * strength
+            face[m, 9 + i] = albedo[material[k], i] * light
+        face[m, 12] = albedo[material[k], 3] * strength
         m += 1
     return m
 
@@ -380,6 +383,18 @@ def _resample_pixel(
 
 
 @kernel
+def _cover_pixel(
+    k: int, face: Array, x0: float, y0: float, lattice: Array, e: int, near: Array, owner: Ints
+) -> None:
+    """As ``_resample_pixel`` for a pixel that lies inside the triangle."""
+    for s in range(_SAMPLES):
+        w = _at(face, k, 0, x0 + lattice[s, 0], y0 + lattice[s, 1])
+        if w > near[e, s]:
+            near[e, s] = w
+            owner[e, s] = k
+
+
+@kernel
 def _resample(
     shown: _Shown,
     count: int,
@@ -413,9 +428,17 @@ def _resample(
                 c = edge[k, 3 * n + 1] * y + edge[k, 3 * n + 2] + slack[n]
                 first, last = _narrow(per[n], c, origin, first, last)
             for j in range(first, last):
-                e = slot[i, j]
-                if e >= 0:
-                    _resample_pixel(k, edge, face, ray_x[j], y, lattice, e, near, owner)
+                e, x = slot[i, j], ray_x[j]
+                if e < 0:
+                    continue
+                if (
+                    _at(edge, k, 0, x, y) > slack[0]
+                    and _at(edge, k, 3, x, y) > slack[1]
+                    and _at(edge, k, 6, x, y) > slack[2]
+                ):
+                    _cover_pixel(k, face, x, y, lattice, e, near, owner)
+                else:
+                    _resample_pixel(k, edge, face, x, y, lattice, e, near, owner)
 
 
 @kernel
@@ -530,32 +553,29 @@ def _below(t: float) -> float:
 
 
 @kernel
-def _add_shifted(picture: Array, out: Array, weight: float, rows: int, columns: int) -> None:
-    """Adds ``weight`` times the picture, shifted by whole pixels; its border is repeated."""
-    height, width = picture.shape
-    for i in range(height):
-        r = min(max(i + rows, 0), height - 1)
-        first, last = max(0, -columns), min(width, width - columns)
-        for m in range(first):
-            out[i, m] += weight * picture[r, m % 3]
-        for m in range(first, last):
-            out[i, m] += weight * picture[r, m + columns]
-        for m in range(last, width):
-            out[i, m] += weight * picture[r, width - 3 + m % 3]
-
-
-@kernel
 def _blur(picture: Array, out: Array, length: float, vertical: bool) -> None:
-    """Mean over a stretch of ``length`` px of the linearly interpolated picture."""
-    if length <= 0.0:
-        out[:] = picture
-        return
+    """Mean over a stretch of ``length`` px of the linearly interpolated picture; its border is repeated."""
+    height, width = picture.shape
     half = 0.5 * length
     taps = min(_TAPS, math.ceil(half))
-    out[:] = 0.0
-    for k in range(-taps, taps + 1):
-        weight = (_below(half - k) - _below(-half - k)) / length
-        _add_shifted(picture, out, weight, k if vertical else 0, 0 if vertical else 3 * k)
+    middle = 2.0 * (_below(half) - 0.5) / length if length > 0.0 else 1.0
+    for i in range(height):
+        for m in range(width):
+            out[i, m] = middle * picture[i, m]
+        for k in range(1, taps + 1):
+            weight = (_below(half - k) - _below(-half - k)) / length
+            if vertical:
+                r, q = max(i - k, 0), min(i + k, height - 1)
+                for m in range(width):
+                    out[i, m] += weight * (picture[r, m] + picture[q, m])
+            else:
+                inset = min(3 * k, width // 2)
+                for m in range(inset, width - inset):
+                    out[i, m] += weight * (picture[i, m - 3 * k] + picture[i, m + 3 * k])
+                for m in range(inset):
+                    out[i, m] += weight * (picture[i, m % 3] + picture[i, m + 3 * k])
+                    n = width - 1 - m
+                    out[i, n] += weight * (picture[i, n - 3 * k] + picture[i, width - 3 + n % 3])
 
 
 @kernel
@@ -754,8 +774,11 @@ def apply_sensor(
     out, variance = [], np.empty((2, len(front)))
     for index, raw in enumerate((front, side)):
         require(
-            raw.ndim == 4 and raw.shape[0] == len(look.seed) == len(frame) and raw.shape[3] == 3,
-            f"image has shape {raw.shape}: must be ({len(look.seed)}, height, width, 3)",
+            raw.ndim == 4
+            and min(raw.shape[1:3]) >= 8
+            and raw.shape[0] == len(look.seed) == len(frame)
+            and raw.shape[3] == 3,
+            f"image has shape {raw.shape}: must be ({len(look.seed)}, height, width, 3), at least 8 px",
             RenderError,
         )
         pictures = np.ascontiguousarray(raw, dtype=np.float64).reshape(*raw.shape[:2], -1)
@@ -867,7 +890,8 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 # A forked child has none of the parent's threads and would wait for them for ever.
-os.register_at_fork(after_in_child=_pool.cache_clear)
+if hasattr(os, "register_at_fork"):  # not on Windows, which does not fork
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 class Raycaster:

@@ -23,6 +23,7 @@ _TURN_RAD = np.deg2rad(15.0)
 # From station to station no joint turns as far, unless the branch ends in between.
 _JUMP_RAD = 1.0
 _ELBOW_UP = 5
+_PART_PREFIX = "col_part"
 _TRY_DISTANCE_M = (0.45, 0.35, 0.40, 0.50)
 _TRY_YAW_RAD = (0.0, 0.79, 1.57, 2.36, 3.14, -2.36, -1.57, -0.79)
 
@@ -74,7 +75,7 @@ def check_reach(scene: Scene, shift_m: float, yaw_rad: float) -> Reach:
         + (
             f"It can with pose=({', '.join(f'{v:.3g}' for v in better)})"
             if better
-            else "Nor at other places and angles that were tried: change the part, or seal it in shorter seams"
+            else "Nor at other places and angles that were tried: change the part, or cut its seam in two"
         )
         + f"; the part may be displaced by {shift_m * 1e3:.0f} mm and {np.rad2deg(yaw_rad):.0f} deg"
     )
@@ -94,7 +95,7 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
     # Elbow up first: the branch of the nominal parts, which keeps the forearm off the table. Then the
     # branch that stays farthest from a singularity.
     order = sorted(range(ik.BRANCHES), key=lambda b: (b != _ELBOW_UP, -fits[b].singular))
-    touching = ""
+    contacts = []
     for b in order:
         if fits[b].why:
             continue
@@ -106,8 +107,10 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
                 smallest_singular=fits[b].singular,
                 joint_range=np.stack((flat.min(axis=0), flat.max(axis=0))),
             )
-        touching = touching or why
-    return touching or fits[_ELBOW_UP].why
+        contacts.append(why)
+    # What a user can mend first: a contact with the part.
+    contacts.sort(key=lambda why: _PART_PREFIX not in why)
+    return contacts[0] if contacts else fits[_ELBOW_UP].why
 
 
 def _stations(seam: Seam, step_m: float) -> Array:
@@ -121,16 +124,18 @@ def _stations(seam: Seam, step_m: float) -> Array:
 
 
 def _better_pose(scene: Scene, displacements: Array) -> tuple[float, float, float, float] | None:
-    """A pose x, y, z, yaw at which the part can be sealed: other angles, nearer to and farther from the arm."""
+    """A pose x, y, z, yaw at which the part can be sealed, of a few at other distances and angles."""
     seam = scene.workpiece.seam
     inside = seam.position[(seam.arc >= 0) & (seam.arc <= seam.length)]
     middle = (inside.min(axis=0) + inside.max(axis=0)) / 2
     height = scene.workpiece.pose[2, 3]
     for distance, yaw in product(_TRY_DISTANCE_M, _TRY_YAW_RAD):
-        at = np.round([distance, 0.0, height] - yaw_pose(0, 0, 0, yaw)[:3, :3] @ (middle * [1, 1, 0]), 3)
-        pose = yaw_pose(*at, yaw)
+        turned = yaw_pose(0.0, 0.0, 0.0, yaw)[:3, :3] @ (middle * [1.0, 1.0, 0.0])
+        x, y, z = (float(v) for v in np.round(np.array([distance, 0.0, height]) - turned, 3))
+        pose = yaw_pose(x, y, z, yaw)
+        # Coarsely first: most poses fail somewhere.
         if all(isinstance(_try(scene, pose, displacements, step), Reach) for step in (4 * _STEP_M, _STEP_M)):
-            return float(at[0]), float(at[1]), float(at[2]), float(yaw)
+            return x, y, z, yaw
     return None
 
 
@@ -158,10 +163,14 @@ def _fit(q: Array, s: Array) -> _Fit:
     outside = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=0)
     if outside.any():
         station, joint = np.argwhere(outside)[0]
-        return _Fit(f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam", 0.0)
+        return _Fit(
+            f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam", 0.0
+        )
     smallest = _smallest_singular(q.reshape(-1, 6)).reshape(q.shape[:2]).min(axis=0)
     if smallest.min() < _MIN_SINGULAR:
-        return _Fit(f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam", 0.0)
+        return _Fit(
+            f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam", 0.0
+        )
     return _Fit("", float(smallest.min()))
 
 
@@ -179,8 +188,9 @@ def _touching(scene: Scene, q: Array, displaced: Array, s: Array) -> str:
             mujoco.mj_collision(model, data)
             if data.ncon:
                 names = [model.geom(int(g)).name for g in (data.contact[0].geom1, data.contact[0].geom2)]
+                hint = " (a bend tighter than the gun allows, or a wall in its way)"
                 return (
-                    f"{names[0]} and {names[1]} touch at {station * 1e3:.0f} mm along the seam (a corner "
-                    "tighter than the nozzle allows, a wall in the way, or the part too close to the arm)"
+                    f"{names[0]} and {names[1]} touch at {station * 1e3:.0f} mm along the seam"
+                    f"{hint if any(n.startswith(_PART_PREFIX) for n in names) else ''}"
                 )
     return ""

@@ -70,25 +70,44 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
     )
     world = spec.worldbody
     world.add_geom(
-        name="floor", type=_G.mjGEOM_PLANE, pos=[0, 0, _FLOOR_M], size=[3, 3, 0.1], material="floor",
-        group=GROUP_FURNITURE, **_VISUAL,
+        name="floor",
+        type=_G.mjGEOM_PLANE,
+        pos=[0, 0, _FLOOR_M],
+        size=[3, 3, 0.1],
+        material="floor",
+        group=GROUP_FURNITURE,
+        **_VISUAL,
     )
     thickness = 0.04
     world.add_geom(
-        name="table", type=_G.mjGEOM_BOX, pos=[0.32, 0, TABLE_TOP_M - thickness / 2],
-        size=[0.52, 0.50, thickness / 2], material="bench", group=GROUP_FURNITURE, **_ENVIRONMENT,
+        name="table",
+        type=_G.mjGEOM_BOX,
+        pos=[0.32, 0, TABLE_TOP_M - thickness / 2],
+        size=[0.52, 0.50, thickness / 2],
+        material="bench",
+        group=GROUP_FURNITURE,
+        **_ENVIRONMENT,
     )
     leg = (TABLE_TOP_M - thickness - _FLOOR_M) / 2
     for x in (-0.14, 0.78):
         for y in (-0.44, 0.44):
             world.add_geom(
-                type=_G.mjGEOM_BOX, pos=[x, y, _FLOOR_M + leg], size=[0.03, 0.03, leg], material="steel",
-                group=GROUP_FURNITURE, **_VISUAL,
+                type=_G.mjGEOM_BOX,
+                pos=[x, y, _FLOOR_M + leg],
+                size=[0.03, 0.03, leg],
+                material="steel",
+                group=GROUP_FURNITURE,
+                **_VISUAL,
             )
     height = -TABLE_TOP_M / 2
     world.add_geom(
-        name="pedestal", type=_G.mjGEOM_CYLINDER, pos=[0, 0, TABLE_TOP_M + height], size=[0.095, height, 0],
-        material="steel", group=GROUP_FURNITURE, **_ENVIRONMENT,
+        name="pedestal",
+        type=_G.mjGEOM_CYLINDER,
+        pos=[0, 0, TABLE_TOP_M + height],
+        size=[0.095, height, 0],
+        material="steel",
+        group=GROUP_FURNITURE,
+        **_ENVIRONMENT,
     )
     for k, (position, strength) in enumerate((((0.9, -0.7, 1.6), 0.55), ((-0.3, 0.9, 1.8), 0.35))):
         light = world.add_light(name=f"lamp{k}", pos=position, dir=np.subtract((0.35, 0, 0), position))
@@ -178,8 +197,12 @@ def _add_part(spec: mujoco.MjSpec, workpiece: Workpiece) -> None:
         mesh.userface = np.arange(3 * count, dtype=np.int32)
         mesh.userfacetexcoord = np.arange(3 * count, dtype=np.int32)
         part.add_geom(
-            name=f"look_{material.name}", type=_G.mjGEOM_MESH, meshname=f"look_{material.name}",
-            material=material.name, group=GROUP_PART, **_VISUAL,
+            name=f"look_{material.name}",
+            type=_G.mjGEOM_MESH,
+            meshname=f"look_{material.name}",
+            material=material.name,
+            group=GROUP_PART,
+            **_VISUAL,
         )
     for k, solid in enumerate(workpiece.solids):
         _add_solid(part, spec, k, solid)

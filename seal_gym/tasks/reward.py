@@ -51,9 +51,7 @@ class RewardCfg:
     @property
     def bound(self) -> float:
         """Largest magnitude of a step's reward."""
-        return (
-            self.progress + self.approach + self.heading + self.smoothness + max(self.reached, self.failed)
-        )
+        return self.progress + self.approach + self.heading + self.smoothness + max(self.reached, self.failed)
 
 
 def reward(

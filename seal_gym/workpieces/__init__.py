@@ -1,0 +1,1 @@
+"""Seam curves, and the parts that carry them."""

@@ -128,7 +128,7 @@ def get(workpiece: str | Workpiece) -> Workpiece:
         return workpiece
     if workpiece not in _CATALOGUE:
         raise SeamError(
-            f"workpiece = {workpiece!r}: must be one of {list(NAMES)} or a Workpiece (Workpiece.from_polyline, "
-            "Workpiece.from_mesh)"
+            f"workpiece = {workpiece!r}: must be one of {list(NAMES)} or a Workpiece "
+            "(Workpiece.from_polyline, Workpiece.from_mesh)"
         )
     return _CATALOGUE[workpiece]()

@@ -8,7 +8,6 @@ from typing import Self
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from seal_gym.core.errors import SeamError, require
 from seal_gym.core.frames import Array, cross, normalise
@@ -39,7 +38,9 @@ def read_mesh(path: Path, scale: float) -> Array:
         SeamError: If there is no such file, its type is another, it holds no usable mesh, too many
             triangles or the scale is not a positive number.
     """
-    require(path.is_file(), f"mesh file {str(path)!r} not found: give the path of an STL or OBJ file", SeamError)
+    require(
+        path.is_file(), f"mesh file {str(path)!r} not found: give the path of an STL or OBJ file", SeamError
+    )
     require(
         path.suffix.lower() in (".stl", ".obj"),
         f"mesh file {path.name!r} has the type {path.suffix!r}: must be .stl or .obj",
@@ -192,6 +193,8 @@ def _piece(shape: _Topology, members: NDArray[np.intp]) -> Array | None:
 
 def _fits(shape: _Topology, members: NDArray[np.intp], points: Array) -> bool:
     """Whether no other triangle reaches into the hull of the points (or, of an open mesh, the area fits)."""
+    from scipy.spatial import ConvexHull, QhullError  # takes 0.2 s to load: only for those who need it
+
     try:
         body = ConvexHull(points)
     except QhullError:

@@ -198,8 +198,8 @@ def _check_points(points: ArrayLike, approach: ArrayLike) -> tuple[Array, Array]
         k = _first(~np.all(np.isfinite(values), axis=1))
         require(
             k is None,
-            f"{name}[{k}] = {values[k].tolist() if k is not None else ''} is not finite: every number must be, "
-            "no NaN or inf",
+            f"{name}[{k}] = {values[k].tolist() if k is not None else ''} is not finite: every number "
+            "must be, no NaN or inf",
             SeamError,
         )
     k = _first(np.abs(p).max(axis=1) > MAX_COORDINATE_M)
@@ -213,16 +213,16 @@ def _check_points(points: ArrayLike, approach: ArrayLike) -> tuple[Array, Array]
     k = _first(np.abs(size - 1.0) > 1e-3)
     require(
         k is None,
-        f"approach[{k}] = {a[k or 0].tolist()} has length {size[k or 0]:.4g}: must be a unit vector; divide it "
-        "by its length",
+        f"approach[{k}] = {a[k or 0].tolist()} has length {size[k or 0]:.4g}: must be a unit vector; divide "
+        "it by its length",
         SeamError,
     )
     gap = np.linalg.norm(np.diff(p, axis=0), axis=1)
     k = _first(gap < MIN_SPACING_M)
     require(
         k is None,
-        f"points {k} and {(k or 0) + 1} are {gap[k or 0] * 1e3:.3g} mm apart: two points alike; keep neighbours "
-        f"at least {MIN_SPACING_M * 1e3:g} mm apart, drop one of them",
+        f"points {k} and {(k or 0) + 1} are {gap[k or 0] * 1e3:.3g} mm apart: two points alike; keep "
+        f"neighbours at least {MIN_SPACING_M * 1e3:g} mm apart, drop one of them",
         SeamError,
     )
     return p, a / size[:, None]
@@ -234,14 +234,14 @@ def _segments_cross(p: Array, clearance_m: float, closed: bool) -> tuple[int, in
     end, n = p[1:, :2], len(p) - 1
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
 
-    def to_segment(points: Array, k: Array | int) -> Array:
+    def to_segment(points: Array, k: NDArray[np.intp] | int) -> Array:
         r, along = points - start[k], d[k]
         square = np.maximum(np.sum(along**2, axis=-1), 1e-18)
         w = np.clip(np.sum(r * along, axis=-1) / square, 0.0, 1.0)
         return np.asarray(np.linalg.norm(r - w[..., None] * along, axis=-1))
 
     for i in range(n - 2):
-        j = np.arange(i + 2, n - 1 if closed and i == 0 else n)
+        j: NDArray[np.intp] = np.arange(i + 2, n - 1 if closed and i == 0 else n)
         r = start[j] - start[i]
         det = d[i, 0] * d[j, 1] - d[i, 1] * d[j, 0]
         safe = np.where(np.abs(det) < 1e-15, 1.0, det)
@@ -249,7 +249,12 @@ def _segments_cross(p: Array, clearance_m: float, closed: bool) -> tuple[int, in
         v = (r[:, 0] * d[i, 1] - r[:, 1] * d[i, 0]) / safe
         hit = (np.abs(det) >= 1e-15) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
         # Where two segments do not cross, they are nearest at an end of one of them.
-        ends = (to_segment(start[i], j), to_segment(end[i], j), to_segment(start[j], i), to_segment(end[j], i))
+        ends = (
+            to_segment(start[i], j),
+            to_segment(end[i], j),
+            to_segment(start[j], i),
+            to_segment(end[j], i),
+        )
         near = np.min(ends, axis=0) < clearance_m
         # Along a bend neighbours come close as well: only what lies more than half a turn away counts.
         apart = arc[j] - arc[i + 1]
@@ -311,8 +316,8 @@ def _round(p: Array, corner_radius: float, n_head: int) -> list[_Piece]:
         arc, r = _round_vertex(p[k - 1], p[k], p[k + 1], corner_radius if corner else None)
         require(
             r >= MIN_CORNER_RADIUS_M - 1e-12,
-            f"the curve at point {k - n_head} has a radius of {r * 1e3:.2f} mm: tighter than the nozzle allows; keep "
-            f"it at {MIN_CORNER_RADIUS_M * 1e3:g} mm or more",
+            f"the curve at point {k - n_head} has a radius of {r * 1e3:.2f} mm: tighter than the nozzle "
+            f"allows; keep it at {MIN_CORNER_RADIUS_M * 1e3:g} mm or more",
             SeamError,
         )
         pieces.append(_Piece(arc, corner))
@@ -348,8 +353,8 @@ def _lean(p: Array, a: Array) -> tuple[Array, float]:
     k = _first(sides == -side)
     require(
         k is None,
-        f"approach leans to the {'right' if side > 0 else 'left'} of travel at first and to the other side at "
-        f"point {k}: the wall would change sides; keep it on one side",
+        f"approach leans to the {'right' if side > 0 else 'left'} of travel at first and to the other side "
+        f"at point {k}: the wall would change sides; keep it on one side",
         SeamError,
     )
     return lean, side
@@ -411,8 +416,8 @@ def build_seam(
     require(
         crossed is None,
         f"{_stretches(crossed, len(p))} of the polyline cross or come within "
-        f"{_SELF_CLEARANCE_M * 1e3:g} mm of each other: a seam must not cross itself; it runs on straight for "
-        f"{run_on_m * 1e3:g} mm past both ends, so that the cameras do not see its end",
+        f"{_SELF_CLEARANCE_M * 1e3:g} mm of each other: a seam must not cross itself; it runs on "
+        f"straight for {run_on_m * 1e3:g} mm past both ends, so that the cameras do not see its end",
         SeamError,
     )
     n_head = len(head)
@@ -453,7 +458,7 @@ def _along(p: Array, distance: float) -> Array:
     return p[1 : 2 + min(int(np.searchsorted(arc, distance)), len(arc) - 1)]
 
 
-def _tangents(position: Array, pieces: list[_Piece], which: Array) -> Array:
+def _tangents(position: Array, pieces: list[_Piece], which: NDArray[np.intp]) -> Array:
     """Tangents at the samples: exact on lines, and on arcs the bisector of a circle's two chords."""
     u = normalise(np.diff(position, axis=0))
     tangent = np.concatenate((u[:1], normalise(u[:-1] + u[1:]), u[-1:]))
@@ -475,8 +480,9 @@ def _check_lean(arc: Array, lean: Array) -> None:
     worst = int(np.argmax(rate))
     require(
         bool(rate[worst] <= MAX_LEAN_RATE_RAD_M) and bool(np.ptp(lean) <= MAX_LEAN_CHANGE_RAD + 1e-9),
-        f"the approach direction turns about y (its lean changes) by {np.rad2deg(np.ptp(lean)):.1f} deg in all "
-        f"and by up to {np.rad2deg(rate[worst]) * 1e-3:.2f} deg/mm: the four ROI features cannot show it; at "
-        f"most {np.rad2deg(MAX_LEAN_CHANGE_RAD):.0f} deg and {np.rad2deg(MAX_LEAN_RATE_RAD_M) * 1e-3:.1f} deg/mm",
+        f"the approach direction turns about y (its lean changes) by {np.rad2deg(np.ptp(lean)):.1f} deg in "
+        f"all and by up to {np.rad2deg(rate[worst]) * 1e-3:.2f} deg/mm: the four ROI features cannot show it; at "
+        f"most {np.rad2deg(MAX_LEAN_CHANGE_RAD):.0f} deg and "
+        f"{np.rad2deg(MAX_LEAN_RATE_RAD_M) * 1e-3:.1f} deg/mm",
         SeamError,
     )

@@ -1,11 +1,11 @@
 """Surfaces and collision solids swept along seams."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
 
 from seal_gym.core.frames import Array, cross, normalise, transform
 from seal_gym.workpieces.surface import Surface
@@ -86,9 +86,7 @@ def _strip(a: Array, b: Array) -> Array:
     first = np.stack((a[:-1], b[:-1], b[1:]), axis=1)
     second = np.stack((a[:-1], b[1:], a[1:]), axis=1)
     triangles = np.concatenate((first, second))
-    area = np.linalg.norm(
-        cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    )
+    area = np.linalg.norm(cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
     return triangles[area > 1e-14]
 
 
@@ -248,18 +246,16 @@ def sweep_wall(
     right_hand = float(np.sum(cross(tangent, _UP) * outward[:-1])) > 0
     bands = [(face_high, face_low), (back_high, face_high), (back_foot, back_high)]
     triangles = np.concatenate([_strip(*(band if right_hand else band[::-1])) for band in bands])
-    ends = _end_caps((face_low, face_high, back_high, back_foot), forward=right_hand)
+    ends = _end_caps((face_low, face_high, back_high, back_foot), forward=not right_hand)
     pieces = []
     index = simplify(curve, 5e-5)
-    for a, b in zip(index[:-1], index[1:], strict=True):
+    for a, b in pairwise(index):
         corners = [face_low[[a, b]] * [1, 1, 0], face_high[[a, b]], back_foot[[a, b]], back_high[[a, b]]]
         pieces.append(hull(np.concatenate(corners)))
     return _surface(np.concatenate((triangles, ends)), material), pieces
 
 
-def sweep_ledge(
-    curve: Array, outward: Array, width: float, material: int
-) -> tuple[Surface, list[Solid]]:
+def sweep_ledge(curve: Array, outward: Array, width: float, material: int) -> tuple[Surface, list[Solid]]:
     """A raised floor beside a curve that leaves the plate's plane, and its skirt down to the plate.
 
     Args:
@@ -277,12 +273,12 @@ def sweep_ledge(
     right_hand = float(np.sum(cross(tangent, _UP) * outward[:-1])) > 0
     bands = [(inner, outer), (outer, outer_foot)]
     triangles = np.concatenate([_strip(*(band if right_hand else band[::-1])) for band in bands])
-    ends = _end_caps((inner_foot, inner, outer, outer_foot), forward=not right_hand)
+    ends = _end_caps((inner_foot, inner, outer, outer_foot), forward=right_hand)
     triangles = np.concatenate((triangles, ends))
     index = simplify(curve, 5e-5)
     pieces = [
         hull(np.concatenate([rail[[a, b]] for rail in (inner, outer, inner_foot - 1e-3 * _UP, outer_foot)]))
-        for a, b in zip(index[:-1], index[1:], strict=True)
+        for a, b in pairwise(index)
     ]
     return _surface(triangles, material), pieces
 
@@ -303,6 +299,8 @@ def groove_plate(
     Returns:
         The surface, and the plate's smallest and largest x, y [m].
     """
+    from scipy.spatial import Delaunay  # takes 0.2 s to load: only for those who need it
+
     # Evenly spaced banks, closer together than the groove is wide: Delaunay then keeps them as edges.
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))))
     s = np.linspace(0.0, arc[-1], int(np.ceil(arc[-1] / (0.6 * half_width))) + 1)

@@ -121,8 +121,8 @@ class Workpiece:
             The workpiece. It collides as it looks, concave or not (``convex_pieces``).
 
         Raises:
-            SeamError: See ``build_seam`` and ``read_mesh``; and if the seam does not lie on the mesh or the pose
-                is not four numbers.
+            SeamError: See ``build_seam`` and ``read_mesh``; and if the seam does not lie on the mesh or
+                the pose is not four numbers.
         """
         path = Path(path)
         triangles = read_mesh(path, scale)
@@ -166,12 +166,20 @@ def _extent(seam: Seam, margin: float) -> tuple[tuple[float, float], tuple[float
     return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
 
 
+def _once(seam: Seam) -> slice:
+    """The samples that the part carries: all, but of a closed seam only one round, without its run-on."""
+    if not seam.closed:
+        return slice(None)
+    first, last = np.searchsorted(seam.arc, [-1e-9, seam.length + 1e-9])
+    return slice(int(first), int(last))
+
+
 def _fillet(seam: Seam, wall_height: float) -> tuple[Surface, list[Solid]]:
     low, high = WALL_HEIGHT_M
     require(
         low <= wall_height <= high,
-        f"wall_height = {wall_height!r}: must be in {low}..{high} m; a lower wall's top edge is taken for the "
-        "seam, a higher one blocks the side camera",
+        f"wall_height = {wall_height!r}: must be in {low}..{high} m; a lower wall's top edge is taken for "
+        "the seam, a higher one blocks the side camera",
         SeamError,
     )
     # Against the floor, which follows the seam, so across it.
@@ -179,8 +187,9 @@ def _fillet(seam: Seam, wall_height: float) -> tuple[Surface, list[Solid]]:
     low, high = FILLET_LEAN_RAD
     require(
         bool(np.all((lean > low - 1e-6) & (lean < high + 1e-6))),
-        f"the approach direction leans {np.rad2deg(lean.min()):.1f}..{np.rad2deg(lean.max()):.1f} deg from the "
-        f"plate's normal: a fillet needs {np.rad2deg(low):.0f}..{np.rad2deg(high):.0f} deg, or the nozzle touches",
+        f"the approach direction leans {np.rad2deg(lean.min()):.1f}..{np.rad2deg(lean.max()):.1f} deg from "
+        f"the plate's normal: a fillet needs {np.rad2deg(low):.0f}..{np.rad2deg(high):.0f} deg, or the nozzle "
+        "touches",
         SeamError,
     )
     z = seam.position[:, 2]
@@ -202,16 +211,19 @@ def _fillet(seam: Seam, wall_height: float) -> tuple[Surface, list[Solid]]:
     needed = _HOLLOW_SHARE * wall_height
     require(
         hollow * needed < 1.0,
-        f"a hollow bend has a radius of {1e3 / max(hollow, 1e-9):.1f} mm: the nozzle, leaning over it, needs "
-        f"{needed * 1e3:.1f} mm beside a wall of {wall_height * 1e3:.0f} mm; enlarge corner_radius or lower the wall",
+        f"a hollow bend has a radius of {1e3 / max(hollow, 1e-9):.1f} mm: the gun, leaning over it, needs "
+        f"{needed * 1e3:.1f} mm beside a wall of {wall_height * 1e3:.0f} mm; enlarge corner_radius or lower the "
+        "wall",
         SeamError,
     )
     surface, plate = solids.plate(*_extent(seam, _PLATE_MARGIN_M), PLATE_THICKNESS_M, PLATE)
-    wall, pieces = solids.sweep_wall(seam.position, outward, thickness, wall_height, WALL)
+    once = _once(seam)
+    curve, outward = seam.position[once], outward[once]
+    wall, pieces = solids.sweep_wall(curve, outward, thickness, wall_height, WALL)
     parts = [surface, wall]
     if z.max() > 1e-9:
         width = min(0.025, 0.6 / hollow if hollow > 0 else np.inf)
-        ledge, blocks = solids.sweep_ledge(seam.position, outward, width, PLATE)
+        ledge, blocks = solids.sweep_ledge(curve, outward, width, PLATE)
         parts.append(ledge)
         pieces += blocks
     return Surface.join(*parts), [plate, *pieces]
@@ -237,10 +249,9 @@ def _groove(seam: Seam, groove_width: float) -> tuple[Surface, list[Solid]]:
         SeamError,
     )
     right = normalise(cross(seam.tangent, np.array([0.0, 0.0, 1.0])))
-    # A closed groove is milled once round, not again along its run-on.
-    milled = np.flatnonzero((seam.arc > -1e-9) & (seam.arc < seam.length + 1e-9)) if seam.closed else slice(None)
+    once = _once(seam)
     surface, lower, upper = solids.groove_plate(
-        seam.position[milled], right[milled], groove_width / 2, groove_width, _PLATE_MARGIN_M, (PLATE, WALL)
+        seam.position[once], right[once], groove_width / 2, groove_width, _PLATE_MARGIN_M, (PLATE, WALL)
     )
     # The mouth spans the groove, so a plate without one stops it at the same places.
     rim = solids.rim(lower, upper, PLATE_THICKNESS_M, PLATE)

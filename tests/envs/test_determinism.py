@@ -1,7 +1,5 @@
 """Seeds, independence of what is returned, and that every number of the observation means something."""
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -82,10 +80,6 @@ def test_different_seeds_differ(make, env_id):
     assert len(np.unique(starts, axis=0)) == 10
 
 
-def seconds_turn(rotation, axis):
-    return np.arctan2(rotation[(axis + 2) % 3, (axis + 1) % 3], rotation[(axis + 1) % 3, (axis + 1) % 3])
-
-
 @pytest.mark.parametrize("env_id", IDS)
 def test_initial_states_fill_the_protocols_ranges(make, env_id):
     """Pose of part and gun, from the physics: +-20 mm, +-15 deg; 7-12 mm, +-5 mm, +-5 deg."""
@@ -105,7 +99,6 @@ def test_initial_states_fill_the_protocols_ranges(make, env_id):
         tip = np.linalg.inv(pose) @ core.tip.pose[0]
         offset = frame.T @ (tip[:3, 3] - start.position)
         turn = frame.T @ tip[:3, :3]  # about z, then about x: its y column shows both
-        assert abs(turn[0, 2] - np.sin(np.arctan2(-turn[0, 1], turn[0, 0])) * turn[1:, 1:][0, 1] * -1) < 1
         draws.append(
             [
                 *1e3 * shift[:2, 3], np.rad2deg(np.arctan2(shift[1, 0], shift[0, 0])),
@@ -147,24 +140,19 @@ def test_the_validity_flags_are_not_constant_either(make):
 def test_nothing_returned_shares_memory(make, env_id, observation):
     """Not among calls, and not with the environment: scribbling over it all changes no number."""
     env, clean = (make(env_id, observation=observation, control="rmp") for _ in range(2))
-    rng, rng2 = np.random.default_rng(1), np.random.default_rng(1)
+    actions = np.random.default_rng(1).uniform(-1, 1, (6, 27)).astype(np.float32)
     kept = []
-    for k in range(6):
-        action = rng.uniform(-1, 1, 27).astype(np.float32)
-        result = env.reset(seed=3) if k == 0 else env.step(action)
-        expected = clean.reset(seed=3) if k == 0 else clean.step(rng2.uniform(-1, 1, 27).astype(np.float32))
-        if k == 0:
-            rng2.uniform(-1, 1, 27)
+    for action in actions:
+        mine = action.copy()
+        result = env.step(mine) if kept else env.reset(seed=3)
+        expected = clean.step(action) if kept else clean.reset(seed=3)
         for x, y in zip(result, expected, strict=True):
             same(x, y)
-        mine = arrays(result[0]) + arrays(result[-1])
-        assert mine
-        for array in mine:
+        returned = arrays(result[0]) + arrays(result[-1])
+        for array in returned:
             assert array.flags.writeable
             assert not any(np.shares_memory(array, other) for other in kept)
-        kept += mine
-        before = copy.deepcopy(action)
-        for array in mine:
+        kept += returned
+        for array in [*returned, mine]:
             array[...] = 77
-        action[...] = 0.5
-        assert (before != action).any()
+    assert len(kept) >= 12

@@ -1,6 +1,7 @@
 """Parts: what a camera sees agrees with what the gun can hit, nothing is inside out, bad input is refused."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from seal_gym.workpieces.workpiece import Workpiece
 
 Array = NDArray[np.float64]
 R = np.sqrt(0.5)
+UP = np.array([0.0, 0.0, 1.0])
 STRAIGHT = [[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]]
 TO_RIGHT = [0.0, -R, R]
 
@@ -71,7 +73,7 @@ def closed_groove() -> Workpiece:
 def post() -> Workpiece:
     t = np.linspace(-np.pi, np.pi, 73)
     out = np.column_stack((np.cos(t), np.sin(t), 0 * t))
-    return Workpiece.from_polyline(0.06 * out, R * (out + [0, 0, 1.0]), name="post")
+    return Workpiece.from_polyline(0.06 * out, R * (out + UP), name="post")
 
 
 PARTS: dict[str, Callable[[], Workpiece]] = {
@@ -172,7 +174,7 @@ def test_no_crack_along_the_seam_and_the_wall_on_the_right_side(name: str) -> No
     s = rng.uniform(-0.025, part.seam.length + 0.025, 300)
     p, t, a = part.seam.at(s)
     x = np.cross(t, a)
-    offset = rng.choice([-1.0, 1.0], len(s)) * 10 ** rng.uniform(-6, -3, len(s))
+    offset = rng.choice([-1.0, 1.0], len(s)) * 10 ** rng.uniform(-4.5, -3, len(s))
     if "groove" in name:
         return  # its walls are vertical: the mouth's own axis looks straight down them
     origin = p + 0.004 * a + offset[:, None] * x
@@ -194,7 +196,6 @@ def test_groove_is_open_along_its_whole_length_and_the_plate_has_no_hole(
     p, t, _ = part.seam.at(rng.uniform(0, part.seam.length, 300))
     right = np.cross(t, [0, 0, 1.0])
     down = np.tile([0.0, 0.0, -1.0], (300, 1))
-    inside, _ = first_hit(part.surface.triangles, p + rng.uniform(-9e-4, 9e-4, (300, 1)) * right + 0.01, down)
     inside, _ = first_hit(
         part.surface.triangles, p + rng.uniform(-9e-4, 9e-4, (300, 1)) * right + [0, 0, 0.01], down
     )
@@ -254,7 +255,9 @@ def test_bad_parts_are_refused(options: dict, message: str) -> None:
 
 def test_hollow_corner_tighter_than_the_gun_is_refused() -> None:
     points = np.array([[-0.1, 0, 0], [0, 0, 0], [0, 0.1, 0]])
-    with pytest.raises(SeamError, match=r"hollow bend has a radius of 6.0 mm.*needs 13.5 mm beside a wall of 30"):
+    with pytest.raises(
+        SeamError, match=r"hollow bend has a radius of 6.0 mm.*needs 13.5 mm beside a wall of 30"
+    ):
         Workpiece.from_polyline(*leaning(points, -1.0), corner_radius=6e-3)
     Workpiece.from_polyline(*leaning(points, -1.0), corner_radius=14e-3)
     # Round the outside the same corner is no trouble.
@@ -283,7 +286,16 @@ def test_surface_is_checked() -> None:
 def box(lower: tuple[float, ...], upper: tuple[float, ...]) -> Array:
     (x0, y0, z0), (x1, y1, z1) = lower, upper
     v = np.array(
-        [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0], [x0, y0, z1], [x1, y0, z1], [x1, y1, z1], [x0, y1, z1]]
+        [
+            [x0, y0, z0],
+            [x1, y0, z0],
+            [x1, y1, z0],
+            [x0, y1, z0],
+            [x0, y0, z1],
+            [x1, y0, z1],
+            [x1, y1, z1],
+            [x0, y1, z1],
+        ]
     )
     faces = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4]]
     faces += [[1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
@@ -291,14 +303,14 @@ def box(lower: tuple[float, ...], upper: tuple[float, ...]) -> Array:
 
 
 def extrusion(profile: Array, half_length: float) -> Array:
-    """A closed prism along x over a profile (y, z), counter-clockwise seen from +x, star-shaped from corner 0."""
+    """A closed prism along x over a profile (y, z), counter-clockwise seen from +x; corner 0 sees all others."""
     n = len(profile)
     ends = [np.column_stack((np.full(n, x), profile)) for x in (-half_length, half_length)]
     fan = np.array([[0, k, k + 1] for k in range(1, n - 1)])
     k, after = np.arange(n), (np.arange(n) + 1) % n
     low, high = ends
     sides = (np.stack((low[k], low[after], high[after]), 1), np.stack((low[k], high[after], high[k]), 1))
-    return np.concatenate((high[fan], low[fan[:, ::-1]], sides[0][:, ::-1], sides[1][:, ::-1]))
+    return np.concatenate((high[fan], low[fan[:, ::-1]], *sides))
 
 
 # Counter-clockwise from the fillet, which sees every corner of this L of plate and wall.
@@ -321,7 +333,9 @@ def write_obj(path: Path, triangles: Array) -> Path:
     return path
 
 
-L_OF_TWO_BOXES = np.concatenate((box((-0.2, -0.09, -0.02), (0.2, 0.04, 0)), box((-0.19, 0, 0), (0.19, 0.008, 0.03))))
+L_OF_TWO_BOXES = np.concatenate(
+    (box((-0.2, -0.09, -0.02), (0.2, 0.04, 0)), box((-0.19, 0, 0), (0.19, 0.008, 0.03)))
+)
 L_IN_ONE = extrusion(PROFILE, 0.2)
 SEAM = [[-0.15, 0.0, 0.0], [0.15, 0.0, 0.0]]
 
@@ -337,7 +351,7 @@ def tube(n: int = 48) -> Array:
         return np.concatenate((np.stack((a[:-1], b[:-1], b[1:]), 1), np.stack((a[:-1], b[1:], a[1:]), 1)))
 
     rings = [ring(0.056, 0.03), ring(0.056, 0.0), ring(0.05, 0.0), ring(0.05, 0.03), ring(0.056, 0.03)]
-    return np.concatenate([band(a, b) for a, b in zip(rings[:-1], rings[1:], strict=True)])
+    return np.concatenate([band(a, b) for a, b in pairwise(rings)])
 
 
 @pytest.mark.parametrize("triangles", [L_OF_TWO_BOXES, L_IN_ONE, tube()], ids=["boxes", "one", "tube"])
@@ -348,7 +362,10 @@ def test_convex_pieces_have_the_surface_of_the_mesh(triangles: Array) -> None:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     # From far outside, and from the free space beside the wall or within the tube.
-    starts = [rng.uniform(low, high, (600, 3)) - direction, rng.uniform([-0.15, -0.03, 5e-3], [0.15, -5e-3, 0.02], (600, 3))]
+    starts = [
+        rng.uniform(low, high, (600, 3)) - direction,
+        rng.uniform([-0.15, -0.03, 5e-3], [0.15, -5e-3, 0.02], (600, 3)),
+    ]
     if len(triangles) > 100:
         starts[1] = rng.uniform([-0.03, -0.03, 5e-3], [0.03, 0.03, 0.025], (600, 3))
     for origin in starts:
@@ -363,12 +380,12 @@ def test_convex_pieces_have_the_surface_of_the_mesh(triangles: Array) -> None:
 def test_pieces_are_few_where_the_mesh_is_simple() -> None:
     assert len(convex_pieces(L_OF_TWO_BOXES)) == 2
     assert len(convex_pieces(L_IN_ONE)) <= 6
-    assert len(convex_pieces(box((0, 0, 0), (1, 1, 1)))) == 1
+    assert len(convex_pieces(box((0.0, 0, 0), (1, 1, 1)))) == 1
 
 
 def test_open_sheet_stays_a_sheet() -> None:
     # Plate and wall without backs: a closed hull of both would fill the fillet.
-    sheet = L_IN_ONE[[8, 14, 9, 15]] if False else L_OF_TWO_BOXES[[2, 3, 16, 17]]
+    sheet = L_OF_TWO_BOXES[[2, 3, 16, 17]]
     pieces = convex_pieces(sheet)
     assert 2 <= len(pieces) <= 4
     for piece in pieces:
@@ -422,7 +439,9 @@ def test_bad_mesh_arguments_are_refused(tmp_path: Path) -> None:
     for scale in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SeamError, match=r"scale = .*must be a number > 0"):
             Workpiece.from_mesh(path, SEAM, TO_RIGHT, scale=scale)
-    with pytest.raises(SeamError, match=r"mm off the mesh 'part.stl': at most 2 mm; check the units \(scale = 1\)"):
+    with pytest.raises(
+        SeamError, match=r"mm off the mesh 'part.stl': at most 2 mm; check the units \(scale = 1\)"
+    ):
         Workpiece.from_mesh(path, [[-0.15, 0.5, 0.0], [0.15, 0.5, 0.0]], TO_RIGHT)
     with pytest.raises(SeamError, match=r"the seam is 10.0 mm off the mesh"):
         Workpiece.from_mesh(path, np.add(SEAM, [0, -0.05, 0.01]), TO_RIGHT, scale=1e-3)

@@ -10,6 +10,7 @@ from seal_gym.workpieces.seam import RUN_ON_M, Seam, build_seam, nearest_on_path
 
 Array = NDArray[np.float64]
 R = np.sqrt(0.5)
+UP = np.array([0.0, 0.0, 1.0])
 RIGHT_OF_X = [0.0, -R, R]
 STRAIGHT = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
 CORNER = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.1, 0.1, 0.0]]
@@ -20,11 +21,11 @@ def circle(radius: float, first: float, last: float, n: int) -> tuple[Array, Arr
     """Points on a circle about z and approach directions that lean outward."""
     t = np.linspace(first, last, n)
     out = np.column_stack((np.cos(t), np.sin(t), 0 * t))
-    return radius * out, R * (out + [0.0, 0.0, 1.0])
+    return radius * out, R * (out + UP)
 
 
 def helix(n: int = 181) -> tuple[Array, Array, float]:
-    """A seam in space: half a turn at 60 mm radius that rises 20 mm; approach 45 deg to the right of travel."""
+    """A seam in space: half a turn at 60 mm radius that rises 20 mm, leaning 45 deg to the right."""
     t = np.linspace(0.0, np.pi, n)
     radius, pitch = 0.06, 0.02 / np.pi
     p = np.column_stack((radius * np.cos(t), radius * np.sin(t), 0.005 + pitch * t))
@@ -77,7 +78,7 @@ def test_cylinder_against_the_circle() -> None:
     p, t, a = seam.at(s)
     np.testing.assert_allclose(p, 0.07 * radial, atol=1.5e-6)
     np.testing.assert_allclose(t, np.cross([0, 0, 1], radial), atol=2e-5)
-    np.testing.assert_allclose(a, R * (radial + [0, 0, 1]), atol=2e-5)
+    np.testing.assert_allclose(a, R * (radial + UP), atol=2e-5)
 
 
 def test_corner_arc_against_the_circle() -> None:
@@ -206,7 +207,12 @@ def test_nearest_on_path_stays_in_its_window() -> None:
         ([[0, 0, 0], [1e300, 0, 0]], RIGHT_OF_X, {}, r"points\[1\].*beyond 2 m"),
         (STRAIGHT, [0, -1, 1], {}, r"approach\[0\].*length 1.414: must be a unit vector"),
         (STRAIGHT, [0, 0, 0], {}, r"length 0: must be a unit vector"),
-        ([[0, 0, 0], [0, 0, 0], [0.1, 0, 0]], RIGHT_OF_X, {}, r"points 0 and 1 are 0 mm apart.*at least 0.1 mm"),
+        (
+            [[0, 0, 0], [0, 0, 0], [0.1, 0, 0]],
+            RIGHT_OF_X,
+            {},
+            r"points 0 and 1 are 0 mm apart.*at least 0.1 mm",
+        ),
         ([[0, 0, 0], [0.1, 0, 0], [0.1, 5e-5, 0]], RIGHT_OF_X, {}, r"points 1 and 2 are 0.05 mm apart"),
         ([[0, 0, 0], [0.1, 0, 0], [0.02, 0, 0]], RIGHT_OF_X, {}, r"turns back on itself at point 1"),
         (STRAIGHT, [1, 0, 0], {}, r"approach\[0\].*parallel to the seam.*across the seam"),
@@ -218,7 +224,12 @@ def test_nearest_on_path_stays_in_its_window() -> None:
         (CORNER, CORNER_APPROACH, {"corner_radius": -0.01}, r"corner_radius = -0.01: must be"),
         (CORNER, CORNER_APPROACH, {"corner_radius": np.nan}, r"corner_radius = nan: must be"),
         (CORNER, CORNER_APPROACH, {"corner_radius": 2e-3}, r"2 mm at point 1.*tighter.*at least 4 mm"),
-        (CORNER, CORNER_APPROACH, {"corner_radius": 0.06}, r"60 mm does not fit at point 1.*at most 50.00 mm"),
+        (
+            CORNER,
+            CORNER_APPROACH,
+            {"corner_radius": 0.06},
+            r"60 mm does not fit at point 1.*at most 50.00 mm",
+        ),
         (*circle(3e-3, 0, 3, 60), {}, r"radius of 3.00 mm: tighter than the nozzle allows; keep it at 4 mm"),
         (
             STRAIGHT,

@@ -1,0 +1,126 @@
+"""Whether the arm can seal a part is known before the first step, and the reason it cannot is named."""
+
+import time
+
+import numpy as np
+import pytest
+
+from seal_gym.core.cell import load_cell
+from seal_gym.core.errors import SeamError
+from seal_gym.core.frames import tip_rotation
+from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, tip_kinematics
+from seal_gym.sim.reach import Reach, check_reach
+from seal_gym.sim.scene import build_scene
+from seal_gym.workpieces import catalogue
+from seal_gym.workpieces.workpiece import Workpiece
+
+R = np.sqrt(0.5)
+UP = np.array([0.0, 0.0, 1.0])
+SHIFT_M, YAW_RAD = 0.02, np.deg2rad(15.0)
+STRAIGHT, TO_RIGHT = [[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]], [0.0, -R, R]
+# cell.md, degrees.
+START = {
+    "flat": (-4, -117.8, -94.7, -102.4, 87.2, -92.8),
+    "cylinder": (-22.8, -111.4, -110.8, -68.9, 130.7, -30.7),
+    "rectangular": (-26, -106.8, -116.9, -70, 129.5, -34.6),
+}
+
+
+def reach(part: Workpiece) -> Reach:
+    return check_reach(build_scene(part, load_cell()), SHIFT_M, YAW_RAD)
+
+
+@pytest.mark.parametrize("name", catalogue.NAMES)
+def test_catalogue_is_within_reach(name: str) -> None:
+    part = catalogue.get(name)
+    found = reach(part)
+    np.testing.assert_allclose(np.rad2deg(found.start_q), START[name], atol=1.0)
+    assert found.smallest_singular > 0.08
+    assert np.all(found.joint_range[0] > np.deg2rad(-142))
+    assert np.all(found.joint_range[1] < np.deg2rad(142))
+    pose = (
+        part.pose @ np.linalg.inv(part.pose) @ tip_kinematics(found.start_q[None], np.zeros((1, 6))).pose[0]
+    )
+    start = part.seam.at(0.0)
+    rotation = part.pose[:3, :3] @ tip_rotation(start.tangent, start.approach)
+    position = part.pose[:3, :3] @ (start.position + 3e-3 * start.approach) + part.pose[:3, 3]
+    np.testing.assert_allclose(pose[:3, :3], rotation, atol=1e-9)
+    np.testing.assert_allclose(pose[:3, 3], position, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", catalogue.NAMES)
+def test_check_is_quick(name: str) -> None:
+    scene = build_scene(catalogue.get(name), load_cell())
+    check_reach(scene, SHIFT_M, YAW_RAD)
+    times = []
+    for k in range(3):
+        begin = time.perf_counter()
+        check_reach(scene, SHIFT_M, YAW_RAD + 1e-9 * (k + 1))
+        times.append(time.perf_counter() - begin)
+    # 0.04 s on two idle cores; the rest is for a busy machine.
+    assert min(times) < 0.15
+
+
+def test_part_beyond_the_arm_is_refused_with_a_pose_that_would_do() -> None:
+    far = Workpiece.from_polyline(STRAIGHT, TO_RIGHT, name="far", pose=(1.2, 0.0, -0.05, 0.0))
+    with pytest.raises(
+        SeamError, match=r"'far' cannot be sealed.*at 0 mm is out of the arm's reach.*pose=\("
+    ) as e:
+        reach(far)
+    pose = tuple(float(v) for v in str(e.value).split("pose=(")[1].split(")")[0].split(","))
+    reach(Workpiece.from_polyline(STRAIGHT, TO_RIGHT, pose=pose))
+
+
+def test_message_names_the_displacement() -> None:
+    far = Workpiece.from_polyline(STRAIGHT, TO_RIGHT, pose=(1.2, 0.0, -0.05, 0.0))
+    with pytest.raises(SeamError, match=r"displaced by 20 mm and 15 deg"):
+        reach(far)
+
+
+def test_displacement_counts() -> None:
+    # At the edge of reach: fine where it stands, not when it is displaced.
+    part = Workpiece.from_polyline(
+        [[0.0, -0.05, 0.0], [0.0, 0.05, 0.0]], [R, 0, R], pose=(0.55, 0.0, -0.05, 0.0)
+    )
+    scene = build_scene(part, load_cell())
+    check_reach(scene, 0.0, 0.0)
+    with pytest.raises(SeamError):
+        check_reach(scene, 0.25, 0.0)
+
+
+def test_part_that_forces_a_contact_is_refused_with_the_geoms() -> None:
+    t = np.linspace(-np.pi / 2, np.pi / 2, 61)
+    inward = np.column_stack((-np.cos(t), -np.sin(t), 0 * t))
+    points = -0.0185 * inward
+    part = Workpiece.from_polyline(points, R * (inward + UP), wall_height=0.04, name="narrow")
+    with pytest.raises(SeamError, match=r"gun/col_\w+ and col_part_\d+ touch at \d+ mm along the seam"):
+        reach(part)
+
+
+def test_part_under_the_pedestal_is_refused() -> None:
+    part = Workpiece.from_polyline(STRAIGHT, TO_RIGHT, pose=(0.0, 0.0, -0.05, 0.0))
+    with pytest.raises(SeamError, match="cannot be sealed by this cell"):
+        reach(part)
+
+
+def test_seam_that_turns_too_far_is_refused_without_a_vain_hint() -> None:
+    t = np.linspace(-np.pi, np.pi, 73)
+    out = np.column_stack((np.cos(t), np.sin(t), 0 * t))
+    part = Workpiece.from_polyline(0.06 * out, R * (out + UP), name="post")
+    with pytest.raises(SeamError, match="Nor at other places and angles that were tried") as e:
+        reach(part)
+    assert "pose=(" not in str(e.value)
+
+
+def test_tight_outer_corners_are_no_jump_of_the_wrist() -> None:
+    points = [[-0.06, 0.0, 0.0], [0.04, 0.0, 0.0], [0.04, 0.1, 0.0]]
+    approach = [TO_RIGHT, [0.5, -0.5, R], [R, 0, R]]
+    found = reach(Workpiece.from_polyline(points, approach, corner_radius=4e-3))
+    assert np.all((found.joint_range[0] >= JOINT_LOWER) & (found.joint_range[1] <= JOINT_UPPER))
+
+
+def test_closed_groove_takes_a_whole_turn_of_the_last_joint() -> None:
+    t = np.linspace(-np.pi, np.pi, 73)
+    points = 0.05 * np.column_stack((np.cos(t), np.sin(t), 0 * t))
+    found = reach(Workpiece.from_polyline(points, [0, 0, 1.0], joint="groove"))
+    assert np.ptp(found.joint_range[:, 5]) > 1.9 * np.pi
