@@ -75,7 +75,7 @@ def load_policy(name: str, env: Any = None) -> Policy:
     cfg = getattr(env, "unwrapped", env).core.cfg
     if cfg.control != control_of(name):
         raise ConfigError(
-            f"policy {name!r} acts with control={control_of(name)!r}, the environment has {cfg.control!r}: make "
-            f"it with control={control_of(name)!r}"
+            f"policy {name!r} acts with control={control_of(name)!r}, the environment has {cfg.control!r}: "
+            f"make it with control={control_of(name)!r}"
         )
     return make(cell=cfg.cell)

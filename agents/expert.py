@@ -16,8 +16,8 @@ _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 class RmpExpert:
     """Zhou et al.'s Table 1 as a policy: attraction, heading and forward-speed leaves from the features.
 
-    The leaves are summed into one (f, A) in the tip's space, which the ``rmp`` adapter resolves with its fixed
-    leaves. The estimated motion of the seam is fed forward. A view without a line slows the gun down.
+    The leaves are summed into one (f, A) in the tip's space, which the ``rmp`` adapter resolves with its
+    fixed leaves. The estimated motion of the seam is fed forward. A view without a line slows the gun down.
 
     Attributes:
         control: The ``control`` its environment needs.
@@ -66,9 +66,9 @@ class RmpExpert:
         twist = np.concatenate((_MM * o[:, 11:14], _DEG * o[:, 14:17]), axis=1)
         seam = np.zeros_like(twist)
         seam[:, [0, 2]], seam[:, [3, 5]] = _MM * o[:, 6:8], _DEG * o[:, 8:10]
-        speed = self._cell.process.speed_m_s * (o[:, 2] * o[:, 5] > 0.5)
+        speed = np.where(o[:, 2] * o[:, 5] > 0.5, self._cell.process.speed_m_s, 0.0)
         policy = blend(seam_policies(errors, twist, reference_twist(speed, seam), self._sealing))
         action = np.concatenate(
             (policy.accel / self._scale, metric_to_cholesky(policy.metric) / CHOLESKY_SCALE), axis=1
         )
-        return np.minimum(np.maximum(action, -1.0), 1.0)
+        return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0))

@@ -130,7 +130,8 @@ def main(arguments: list[str] | None = None) -> int:
         video = not options.no_video
         if video and _GL == "disabled":
             sys.stderr.write(
-                "no videos: OpenGL is missing here (Debian, Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri)\n"
+                "no videos: OpenGL is missing here (Debian, Ubuntu: apt-get install libegl1 libgl1 "
+                "libgl1-mesa-dri)\n"
             )
             video = False
         for trial in tqdm(wanted[:: options.trials], desc="pictures", unit="part"):

@@ -79,7 +79,7 @@ class Recorder:
 
         def row(error: float) -> int:
             level = (np.log10(min(max(error, 1e-3), 30.0)) + 3.0) / (np.log10(30.0) + 3.0)
-            return int(round(bottom - level * (bottom - top)))
+            return round(float(bottom - level * (bottom - top)))
 
         for error, label in ((1e-3, "0.001"), (1e-2, "0.01"), (0.1, "0.1"), (1.0, "1"), (10.0, "10 mm")):
             cv2.line(strip, (left, row(error)), (right, row(error)), _GRID, 1)
@@ -90,7 +90,7 @@ class Recorder:
         x = left + (right - left) * np.asarray(self.time_s) / span
         points = np.column_stack((x.round(), [row(e) for e in self.error_mm])).astype(np.int32)
         cv2.polylines(strip, [points], False, _CURVE, 2, cv2.LINE_AA)
-        text = f"tip error {self.error_mm[-1]:.3f} mm    t = {self.time_s[-1]:.1f} s    shown {SPEED_UP}x as fast"
+        text = f"tip error {self.error_mm[-1]:.3f} mm    t = {self.time_s[-1]:.1f} s    {SPEED_UP}x real time"
         cv2.putText(strip, text, (left, _STRIP - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
         return np.concatenate((picture, strip))
 
@@ -104,7 +104,7 @@ class Recorder:
             path, fps=30, codec="libx264", quality=7, macro_block_size=8, pixelformat="yuv420p"
         ) as writer:
             for frame in self.frames:
-                writer.append_data(frame)
+                writer.append_data(frame)  # type: ignore[attr-defined]  # imageio types the reader's base
 
     def plot(self, path: Path, title: str) -> None:
         """Plots path against seam from top and side, and the error along the seam.

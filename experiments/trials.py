@@ -78,7 +78,7 @@ def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     if not path.is_file():
         raise SeamError(f"seam file {str(path)!r} not found: give a CSV file with rows x,y,z,ax,ay,az")
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         cells = line.split("#")[0].replace(",", " ").split()
         if not cells or (not rows and any(c.isalpha() and c not in "eE" for c in "".join(cells))):

@@ -117,7 +117,7 @@ class CameraCfg:
     def centre_px(self) -> Array:
         """Principal point in ROI pixel coordinates, shape (2,), px; puts the tip at ``tip_px``."""
         tip = -self.rotation.T @ self.position_m
-        return np.asarray(self.tip_px, dtype=np.float64) - self.focal_px * tip[:2] / tip[2]
+        return np.asarray(np.asarray(self.tip_px, np.float64) - self.focal_px * tip[:2] / tip[2])
 
     def project(self, points_tip: Array) -> Array:
         """Projects points of the tip frame into the ROI.
@@ -129,7 +129,7 @@ class CameraCfg:
             Pixel coordinates, shape (..., 2).
         """
         p = (points_tip - self.position_m) @ self.rotation
-        return self.centre_px + self.focal_px * p[..., :2] / p[..., 2:]
+        return np.asarray(self.centre_px + self.focal_px * p[..., :2] / p[..., 2:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,7 @@ class TimingCfg:
         _positive(self, "frame_rate_hz", "substeps")
         require(
             int(self.substeps) == self.substeps,
-            f"TimingCfg.substeps = {self.substeps!r}: must be a whole number, so that frames and steps line up",
+            f"TimingCfg.substeps = {self.substeps!r}: must be a whole number: frames and steps line up",
         )
 
     @property

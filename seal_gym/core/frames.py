@@ -17,7 +17,7 @@ def normalise(v: Array) -> Array:
     Returns:
         Shape (..., n).
     """
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def cross(a: Array, b: Array) -> Array:

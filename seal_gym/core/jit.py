@@ -5,17 +5,16 @@ same order, so N = 1 and N > 1 agree to the bit, which blocked linear algebra do
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numba
 
-F = TypeVar("F", bound=Callable[..., Any])
 
-
-def kernel(function: F) -> F:
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compiles ``function`` with numba: cached on disk, without the GIL, without fast-math.
 
     Fast-math stays off because it reorders sums, and images and trajectories have to repeat bit for
     bit.
     """
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath=False)(function))
+    compiled: Callable[..., Any] = numba.njit(cache=True, nogil=True, fastmath=False)(function)
+    return compiled

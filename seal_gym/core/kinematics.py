@@ -47,9 +47,19 @@ class TipKinematics(NamedTuple):
 
 
 @kernel
-def _tip_kinematics(  # type: ignore[no-untyped-def]  # compiled: numba infers the types
-    q, qd, dh_d, dh_a, dh_ca, dh_sa, tool, pose, jacobian, drift, twist
-):
+def _tip_kinematics(  # noqa: PLR0912, PLR0915  # one pass along the chain; split, it would run twice
+    q: Array,
+    qd: Array,
+    dh_d: Array,
+    dh_a: Array,
+    dh_ca: Array,
+    dh_sa: Array,
+    tool: Array,
+    pose: Array,
+    jacobian: Array,
+    drift: Array,
+    twist: Array,
+) -> None:
     axis = np.empty((6, 3))
     origin = np.empty((6, 3))
     t = np.empty((3, 4))

@@ -49,8 +49,8 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     | control | n | meaning of 1 |
     | --- | --- | --- |
-    | ``"tip"`` (default) | 6 | tip acceleration, d/dt of the body twist: 1 m/s^2 (x, y, z), 25 rad/s^2 |
-    | ``"rmp"`` | 27 | 6 f as above, then the 21 entries of the lower Cholesky factor of A, row by row, times 2 |
+    | ``"tip"`` (default) | 6 | tip acceleration, d/dt of the body twist: 1 m/s^2, 25 rad/s^2 |
+    | ``"rmp"`` | 27 | 6 f as above, then the 21 entries of A's lower Cholesky factor by rows, times 2 |
     | ``"joint"`` | 6 | joint acceleration, 40 rad/s^2 |
 
     With ``"rmp"`` the policy's leaf is resolved with fixed leaves: damping against the reference twist,
@@ -65,7 +65,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     | 0 | attraction distance, front view: x of the seam in the tip frame | mm | 100 |
     | 1 | seam angle, front view: atan2(dx, dy) of its direction | deg | 180 |
     | 2 | front view valid | 0 or 1 | 1 |
-    | 3 | attraction distance, side view: z of the seam above the point one stand-off before the mouth | mm | 100 |
+    | 3 | attraction distance, side view: z of the seam above one stand-off before the mouth | mm | 100 |
     | 4 | seam angle, side view: atan2(dz, dy) | deg | 180 |
     | 5 | side view valid | 0 or 1 | 1 |
     | 6-7 | estimated velocity of the seam across itself, x and z | mm/s | 1000 |

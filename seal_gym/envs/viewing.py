@@ -61,9 +61,9 @@ def roi_inset(image: NDArray[np.uint8], point: Any, direction: Any, tip: Any) ->
     big = cv2.resize(image, (width * _ZOOM, height * _ZOOM), interpolation=cv2.INTER_NEAREST)
     if point is not None:
         step = 300.0 * np.asarray(direction) / max(float(np.linalg.norm(direction)), 1e-9)
-        ends = [tuple(int(round(_ZOOM * v)) for v in np.asarray(point) + s * step) for s in (-1, 1)]
+        ends = [tuple(round(_ZOOM * v) for v in np.asarray(point) + s * step) for s in (-1, 1)]
         cv2.line(big, ends[0], ends[1], _LINE_RGB, 1, cv2.LINE_AA)
-    centre = tuple(int(round(_ZOOM * v)) for v in tip)
+    centre = tuple(round(_ZOOM * v) for v in tip)
     cv2.drawMarker(big, centre, _TIP_RGB, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
     return np.asarray(big, dtype=np.uint8)
 
@@ -120,7 +120,7 @@ class SceneView:
         where = (left, top + 20)
         cv2.putText(out, label, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
         out[top + 28 : top + 28 + height, left : left + width] = inset
-        return top + 28 + height
+        return int(top + 28 + height)
 
     def _shot(self, name: str, height: int, width: int, camera: mujoco.MjvCamera) -> NDArray[np.uint8]:
         from seal_gym.sim.gl import offscreen  # loads OpenGL: only for pictures

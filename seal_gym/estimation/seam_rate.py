@@ -31,7 +31,7 @@ def _update(
             for k in range(3):
                 p[r] += tip_pose[i, r, k] * point[i, k]
                 d[r] += tip_pose[i, r, k] * direction[i, k]
-            # The chord of an arc is parallel to the mean of its end tangents: travel along the seam drops out.
+            # The chord of an arc is parallel to the mean of its end tangents: travel along it drops out.
             mean[r] = d[r] + last_direction[i, r]
             shift[r] = p[r] - last_point[i, r]
             size += mean[r] * mean[r]

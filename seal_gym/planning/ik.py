@@ -1,6 +1,9 @@
 """Closed-form inverse kinematics of the UR5."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from seal_gym.core.frames import Array, transform
 from seal_gym.core.kinematics import DH_A, DH_COS_ALPHA, DH_D, DH_SIN_ALPHA, T_TOOL0_TIP
@@ -10,7 +13,7 @@ BRANCHES = 8
 _SINGULAR = 1e-9
 
 
-def _link(k: int, angle: Array) -> Array:
+def _link(k: int, angle: NDArray[np.floating[Any]]) -> Array:
     """``T_{k-1,k}`` for joint angles, shape (..., 4, 4)."""
     c, s = np.cos(angle), np.sin(angle)
     ca, sa = DH_COS_ALPHA[k], DH_SIN_ALPHA[k]
@@ -68,9 +71,8 @@ def solve(pose_tip: Array, tool: Array = T_TOOL0_TIP) -> Array:
         s5 = wrist * np.hypot(sine, cosine)
         q5 = np.arctan2(s5, t06[..., 0, 2] * s1 - t06[..., 1, 2] * c1)
         singular = np.abs(s5) < _SINGULAR
-        q6 = np.arctan2(wrist * sine, wrist * cosine)
-        q6 = np.where(singular, 0.0, q6)
-        t14 = _inverse(_link(0, q1)) @ t06 @ _inverse(_link(4, q5) @ _link(5, q6))
+        q6 = np.where(singular, 0.0, np.arctan2(wrist * sine, wrist * cosine))
+        t14: Array = _inverse(_link(0, q1)) @ t06 @ _inverse(_link(4, q5) @ _link(5, q6))
         p13 = t14[..., :3, 3] - DH_D[3] * t14[..., :3, 1]
         reach2 = p13[..., 0] ** 2 + p13[..., 1] ** 2
         cos3 = (reach2 - DH_A[1] ** 2 - DH_A[2] ** 2) / (2 * DH_A[1] * DH_A[2])

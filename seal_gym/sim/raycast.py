@@ -318,7 +318,8 @@ def _torn(p: int, q: int, face: Array, xp: float, yp: float, xq: float, yq: floa
     near_p, near_q = _at(face, p, 0, xp, yp), _at(face, q, 0, xq, yq)
     gap_p = abs(_at(face, q, 0, xp, yp) - near_p)
     gap_q = abs(_at(face, p, 0, xq, yq) - near_q)
-    return min(gap_p, gap_q) > _DEPTH_JUMP * max(near_p, near_q)
+    torn: bool = min(gap_p, gap_q) > _DEPTH_JUMP * max(near_p, near_q)
+    return torn
 
 
 @kernel
@@ -463,7 +464,8 @@ def _tint(k: int, x: float, y: float, face: Array, grain: Array, shift_u: float,
         return 1.0
     z = 1.0 / _at(face, k, 0, x, y)
     u, v = _at(face, k, 3, x, y) * z + shift_u, _at(face, k, 6, x, y) * z + shift_v
-    return 1.0 + strength * _texel(grain, u, v)
+    tint: float = 1.0 + strength * _texel(grain, u, v)
+    return tint
 
 
 @kernel

@@ -153,7 +153,8 @@ class Progress:
             Its distance, and its arc length within a window round zero [m].
         """
         window = self._cfg.window_m
-        return nearest_on_path(self._path, self._seam.arc, tip, -window, window)
+        distance, s = nearest_on_path(self._path, self._seam.arc, tip, -window, window)
+        return distance, s
 
     def advance(self, tip: Array) -> None:
         """Takes the tips' new positions.

@@ -66,9 +66,15 @@ class RoiFeatures(NamedTuple):
         Returns:
             All zero and invalid, pointing along y.
         """
-        pairs = [np.zeros((n, 2)) for _ in range(4)]
-        direction = np.tile([0.0, 1.0, 0.0], (n, 1))
-        return cls(*pairs, np.zeros((n, 2), np.bool_), np.zeros((n, 3)), direction)
+        return cls(
+            d_m=np.zeros((n, 2)),
+            theta_rad=np.zeros((n, 2)),
+            d_px=np.zeros((n, 2)),
+            theta_px_rad=np.zeros((n, 2)),
+            valid=np.zeros((n, 2), np.bool_),
+            point_m=np.zeros((n, 3)),
+            direction=np.tile([0.0, 1.0, 0.0], (n, 1)),
+        )
 
     def clear(self, i: int) -> None:
         """Forgets what one simulation has seen.
@@ -216,7 +222,7 @@ def _length_inside(point: Array, direction: Array, size: Array) -> float:
         a, b = -point[r] / direction[r], (size[r] - point[r]) / direction[r]
         enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     length = np.sqrt(direction[0] ** 2 + direction[1] ** 2)
-    return max(0.0, leave - enter) * length
+    return float(max(0.0, leave - enter) * length)
 
 
 @kernel

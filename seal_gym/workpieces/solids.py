@@ -87,7 +87,7 @@ def _strip(a: Array, b: Array) -> Array:
     second = np.stack((a[:-1], b[1:], a[1:]), axis=1)
     triangles = np.concatenate((first, second))
     area = np.linalg.norm(cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    return triangles[area > 1e-14]
+    return np.asarray(triangles[area > 1e-14])
 
 
 def _end_caps(rails: tuple[Array, Array, Array, Array], *, forward: bool) -> Array:

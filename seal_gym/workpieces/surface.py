@@ -68,7 +68,7 @@ class Surface:
         t = self.triangles
         n = cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
         length = np.linalg.norm(n, axis=-1, keepdims=True)
-        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+        return np.asarray(np.divide(n, length, out=np.zeros_like(n), where=length > 0))
 
     @property
     def uv_m(self) -> Array:

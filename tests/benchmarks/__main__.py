@@ -1,4 +1,4 @@
-"""All speed figures: ``python -m tests.benchmarks`` (the soak runs apart: ``python -m tests.benchmarks.soak``)."""
+"""All speed figures: ``python -m tests.benchmarks``; the soak runs apart, ``...benchmarks.soak``."""
 
 from tests.benchmarks import bench_envs, bench_raycast, bench_rmp
 

@@ -85,8 +85,8 @@ def main() -> None:
         substeps = one.cfg.cell.timing.substeps
         fresh = np.median([first_step_s(part.title()) for _ in range(3)])
         print(
-            f"{part:12} raw mj_step {raw:8.0f}/s = {raw / substeps:6.0f} frames/s | single {single:6.0f} steps/s "
-            f"({single * substeps / raw:.2f} of raw) | vector of 64, 2 threads {vector:6.0f} steps/s "
+            f"{part:12} raw mj_step {raw:8.0f}/s = {raw / substeps:6.0f} frames/s | single {single:6.0f} "
+            f"steps/s ({single * substeps / raw:.2f} of raw) | vector of 64, 2 threads {vector:6.0f} steps/s "
             f"({vector * substeps / raw:.2f}) | first step {fresh:.2f} s after gym.make"
         )
 

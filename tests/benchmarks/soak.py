@@ -67,8 +67,8 @@ def main() -> int:
         print(f"{env_id} {control}: {share // options.num * options.num} steps, {outcomes}")
     seconds = time.perf_counter() - begun
     print(
-        f"{options.steps} steps in {seconds:.0f} s; memory {start:.0f} MiB before, {memory[0]:.0f} after the first "
-        f"case, {memory[len(memory) // 2]:.0f} half way, {memory[-1]:.0f} at the end"
+        f"{options.steps} steps in {seconds:.0f} s; memory {start:.0f} MiB before, {memory[0]:.0f} after "
+        f"the first case, {memory[len(memory) // 2]:.0f} half way, {memory[-1]:.0f} at the end"
     )
     return 0
 

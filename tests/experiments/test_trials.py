@@ -34,7 +34,7 @@ def test_a_bad_row_is_named(tmp_path, text, message):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(SeamError, match="nowhere.csv"):
+    with pytest.raises(SeamError, match=r"nowhere\.csv"):
         trials.read_seam(tmp_path / "nowhere.csv")
 
 
