@@ -1,0 +1,1 @@
+"""The sealing environment: one batched core, its faces, action adapters."""

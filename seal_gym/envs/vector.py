@@ -75,6 +75,7 @@ class SealVectorEnv(VectorEnv, EzPickle):
         require_gymnasium_1()
         check_num_envs(num_envs)
         check_render_mode(render_mode, self.metadata["render_modes"])
+        self._view: SceneView | None = None  # first of all: the base class closes what failed half-way
         EzPickle.__init__(self, num_envs=num_envs, render_mode=render_mode, **kwargs)
         self.num_envs, self.render_mode, self.closed = num_envs, render_mode, False
         self.core = SealCore(SealCfg.of(**kwargs), num_envs)
@@ -85,7 +86,8 @@ class SealVectorEnv(VectorEnv, EzPickle):
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._ended = np.zeros(num_envs, np.bool_)
         self._running = np.zeros(num_envs, np.bool_)
-        self._view = SceneView(self.core) if render_mode else None
+        if render_mode:
+            self._view = SceneView(self.core)
 
     # -- running ----------------------------------------------------------------------------------------
 

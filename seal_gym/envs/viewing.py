@@ -186,11 +186,11 @@ class SceneView:
         """
         core = self._core
         if self._viewer is None:
-            import mujoco.viewer  # loads GLFW: only with a screen
+            from mujoco import viewer  # loads GLFW: only with a screen
 
             self._viewer_data = mujoco.MjData(core.scene.model)
             try:
-                self._viewer = mujoco.viewer.launch_passive(core.scene.model, self._viewer_data)
+                self._viewer = viewer.launch_passive(core.scene.model, self._viewer_data)
             except Exception as error:
                 raise RenderError(
                     f'render_mode="human" needs a screen ({error}): use render_mode="rgb_array" without one'

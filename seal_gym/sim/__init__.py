@@ -1,0 +1,1 @@
+"""MuJoCo scene, batched physics, sensor renderers."""

@@ -48,8 +48,10 @@ class ArmBatch:
         self.part_pose = np.tile(np.eye(4), (n, 1, 1))
         steps = scene.cell.timing.substeps
         self._dt = scene.cell.timing.frame_s
-        # Times at the ends of the substeps, and what they make of speed and acceleration.
-        self._t = (np.arange(1, steps + 1) * scene.cell.timing.step_s)[None, :, None]
+        # An implicit step sees the position it starts from and the speed it ends with.
+        ends = np.arange(1, steps + 1) * scene.cell.timing.step_s
+        self._t_end = ends[None, :, None]
+        self._t_start = self._t_end - scene.cell.timing.step_s
         kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
         self._lead = kv / kp
         self._contact = {"ncon": np.zeros((n, steps), np.int32)}
@@ -99,8 +101,8 @@ class ArmBatch:
             speed = np.where(stopped, 0.0, speed)
         acceleration = (speed - self.qd_command) / dt
         start, rate = self.q_command[:, None], self.qd_command[:, None]
-        t, a = self._t, acceleration[:, None]
-        target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + t * a)
+        t, a = self._t_start, acceleration[:, None]
+        target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + self._t_end * a)
         try:
             touched = self._batch.rollout(target.shape[1], target, record=("ncon",), out=self._contact)[
                 "ncon"

@@ -481,8 +481,8 @@ def _check_lean(arc: Array, lean: Array) -> None:
     require(
         bool(rate[worst] <= MAX_LEAN_RATE_RAD_M) and bool(np.ptp(lean) <= MAX_LEAN_CHANGE_RAD + 1e-9),
         f"the approach direction turns about y (its lean changes) by {np.rad2deg(np.ptp(lean)):.1f} deg in "
-        f"all and by up to {np.rad2deg(rate[worst]) * 1e-3:.2f} deg/mm: the four ROI features cannot show it; at "
-        f"most {np.rad2deg(MAX_LEAN_CHANGE_RAD):.0f} deg and "
+        f"all and by up to {np.rad2deg(rate[worst]) * 1e-3:.2f} deg/mm, which the ROI features cannot show: "
+        f"at most {np.rad2deg(MAX_LEAN_CHANGE_RAD):.0f} deg and "
         f"{np.rad2deg(MAX_LEAN_RATE_RAD_M) * 1e-3:.1f} deg/mm",
         SeamError,
     )

@@ -188,8 +188,8 @@ def _fillet(seam: Seam, wall_height: float) -> tuple[Surface, list[Solid]]:
     require(
         bool(np.all((lean > low - 1e-6) & (lean < high + 1e-6))),
         f"the approach direction leans {np.rad2deg(lean.min()):.1f}..{np.rad2deg(lean.max()):.1f} deg from "
-        f"the plate's normal: a fillet needs {np.rad2deg(low):.0f}..{np.rad2deg(high):.0f} deg, or the nozzle "
-        "touches",
+        f"the plate's normal: a fillet needs {np.rad2deg(low):.0f}..{np.rad2deg(high):.0f} deg, or the "
+        "nozzle touches",
         SeamError,
     )
     z = seam.position[:, 2]
@@ -212,8 +212,8 @@ def _fillet(seam: Seam, wall_height: float) -> tuple[Surface, list[Solid]]:
     require(
         hollow * needed < 1.0,
         f"a hollow bend has a radius of {1e3 / max(hollow, 1e-9):.1f} mm: the gun, leaning over it, needs "
-        f"{needed * 1e3:.1f} mm beside a wall of {wall_height * 1e3:.0f} mm; enlarge corner_radius or lower the "
-        "wall",
+        f"{needed * 1e3:.1f} mm beside a wall of {wall_height * 1e3:.0f} mm; enlarge corner_radius or "
+        "lower the wall",
         SeamError,
     )
     surface, plate = solids.plate(*_extent(seam, _PLATE_MARGIN_M), PLATE_THICKNESS_M, PLATE)

@@ -201,7 +201,16 @@ def test_info_and_observation_tell_the_same(make, observation):
         rows.append(o if observation == "features" else o["features"])
         infos.append(info)
         o, _, _, _, info = env.step(env.action_space.sample())
-    names = ["tip_error_mm", "progress", "collision", "reached", "is_success", "renderer", "seam_velocity", "roi"]
+    names = [
+        "tip_error_mm",
+        "progress",
+        "collision",
+        "reached",
+        "is_success",
+        "renderer",
+        "seam_velocity",
+        "roi",
+    ]
     for row, info in zip(rows, infos, strict=True):
         assert list(info)[: len(names)] == names
         assert ("snr_db" in info) == (observation != "features")

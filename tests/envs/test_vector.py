@@ -217,7 +217,9 @@ def test_wrong_resets(make_vec, kwargs, message):
         make_vec().reset(**kwargs)
 
 
-@pytest.mark.parametrize("kwargs", [{"num_envs": 0}, {"num_envs": 1.5}, {"colour": 1}, {"render_mode": "ansi"}])
+@pytest.mark.parametrize(
+    "kwargs", [{"num_envs": 0}, {"num_envs": 1.5}, {"colour": 1}, {"render_mode": "ansi"}]
+)
 def test_wrong_arguments(make_vec, kwargs):
     with pytest.raises(ConfigError, match=next(iter(kwargs))):
         make_vec(**kwargs)

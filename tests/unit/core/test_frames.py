@@ -48,7 +48,9 @@ def test_tip_rotation():
     tangent = normalise(RNG.normal(size=(20, 3)))
     approach = normalise(RNG.normal(size=(20, 3)))
     rotation = tip_rotation(tangent, approach)
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-13)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (20, 1, 1)), atol=1e-13
+    )
     np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
     np.testing.assert_allclose(rotation[:, :, 1], tangent)
     assert (np.sum(rotation[:, :, 2] * approach, axis=1) > 0).all()

@@ -49,7 +49,9 @@ def test_choices_are_listed(name, bad):
         SealCfg(**{name: bad})
 
 
-@pytest.mark.parametrize(("control", "cls"), [("tip", TipAdapter), ("rmp", RmpAdapter), ("joint", JointAdapter)])
+@pytest.mark.parametrize(
+    ("control", "cls"), [("tip", TipAdapter), ("rmp", RmpAdapter), ("joint", JointAdapter)]
+)
 def test_adapters(control, cls):
     assert isinstance(make_adapter(control, SealCfg().cell, ()), cls)
 

@@ -65,7 +65,11 @@ def test_a_moving_part_shows_its_velocity_across_the_seam_only():
     velocity = np.array([4e-3, 7e-3, -2e-3])
 
     def frame(t):
-        return np.array([1e-3, 0.0, 0.0]) + velocity * t, np.array([0.0, 1.0, 0.0]), pose_of([0.0, 0.01 * t, 0.0])
+        return (
+            np.array([1e-3, 0.0, 0.0]) + velocity * t,
+            np.array([0.0, 1.0, 0.0]),
+            pose_of([0.0, 0.01 * t, 0.0]),
+        )
 
     np.testing.assert_allclose(run(60, frame), [4e-3, 0, -2e-3, 0, 0, 0], atol=1e-12)
 

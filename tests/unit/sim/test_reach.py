@@ -9,7 +9,7 @@ from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import SeamError
 from seal_gym.core.frames import tip_rotation
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, tip_kinematics
-from seal_gym.sim.reach import Reach, check_reach
+from seal_gym.sim.reach import Reach, _stations, check_reach
 from seal_gym.sim.scene import build_scene
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.workpiece import Workpiece
@@ -124,3 +124,15 @@ def test_closed_groove_takes_a_whole_turn_of_the_last_joint() -> None:
     points = 0.05 * np.column_stack((np.cos(t), np.sin(t), 0 * t))
     found = reach(Workpiece.from_polyline(points, [0, 0, 1.0], joint="groove"))
     assert np.ptp(found.joint_range[:, 5]) > 1.9 * np.pi
+
+
+def test_stations_are_close_where_the_seam_turns() -> None:
+    seam = catalogue.rectangular().seam
+    s = _stations(seam, 5e-3)
+    assert s[0] == 0.0
+    assert s[-1] == seam.length
+    assert np.diff(s).min() > 0
+    assert np.diff(s).max() <= 5e-3 + 1e-9
+    tangent = seam.at(s).tangent
+    turn = np.arccos(np.clip(np.sum(tangent[1:] * tangent[:-1], axis=1), -1.0, 1.0))
+    assert np.rad2deg(turn).max() < 15.1

@@ -119,9 +119,7 @@ def test_a_line_is_valid_where_twenty_pixels_of_it_are_in_the_roi():
     heading, pitch = rng.uniform(-0.5, 0.5, (2, n))
     world, tangent, pose, point, direction = world_lines(rng, n, x, z, heading, pitch)
     lines = oracle_lines(world, tangent, pose, VIEWS)
-    seen = np.array(
-        [[seen_length(c, point[i], direction[i]) for c in CELL.cameras] for i in range(n)]
-    )
+    seen = np.array([[seen_length(c, point[i], direction[i]) for c in CELL.cameras] for i in range(n)])
     clear = np.abs(seen - 20.0) > 0.5
     assert 10 < lines.valid.sum() < 2 * n - 10
     np.testing.assert_array_equal(lines.valid[clear], (seen >= 20.0)[clear])

@@ -303,7 +303,7 @@ def box(lower: tuple[float, ...], upper: tuple[float, ...]) -> Array:
 
 
 def extrusion(profile: Array, half_length: float) -> Array:
-    """A closed prism along x over a profile (y, z), counter-clockwise seen from +x; corner 0 sees all others."""
+    """A closed prism along x; profile (y, z) counter-clockwise seen from +x, corner 0 sees all others."""
     n = len(profile)
     ends = [np.column_stack((np.full(n, x), profile)) for x in (-half_length, half_length)]
     fan = np.array([[0, k, k + 1] for k in range(1, n - 1)])
