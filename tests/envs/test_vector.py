@@ -143,7 +143,7 @@ def test_old_gymnasium_is_refused_with_a_way_out():
 
 @pytest.mark.parametrize("version", ["0.29.1", "0.26"])
 def test_versions_before_1(version):
-    with pytest.raises(SealGymError, match="gymnasium >= 1.0"):
+    with pytest.raises(SealGymError, match=r"gymnasium >= 1\.0"):
         require_gymnasium_1(version)
     require_gymnasium_1("1.0.0")
     require_gymnasium_1("1.4.0rc1")

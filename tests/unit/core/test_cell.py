@@ -28,9 +28,9 @@ def with_value(section, key, value):
     for line in TEXT.splitlines():
         if line.startswith("["):
             here = line[1 : line.index("]")]
-        if here == section and line.split("=")[0].strip() == key:
-            line = "" if value is None else f"{key} = {value}"
-        out.append(line)
+        hit = here == section and line.split("=")[0].strip() == key
+        new = "" if value is None else f"{key} = {value}"
+        out.append(new if hit else line)
     assert "\n".join(out) != TEXT.rstrip("\n")
     return "\n".join(out)
 

@@ -23,7 +23,7 @@ def test_failures_at_run_time_are_runtime_errors_too(name):
 
 def test_require():
     require(True, "not shown")
-    with pytest.raises(errors.ConfigError, match="^value = 3$"):
+    with pytest.raises(errors.ConfigError, match=r"^value = 3$"):
         require(False, "value = 3")
     with pytest.raises(errors.SeamError):
         require(False, "", errors.SeamError)

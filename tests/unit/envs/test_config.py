@@ -30,7 +30,7 @@ def test_of_takes_the_attributes_and_nothing_else():
 
 @pytest.mark.parametrize("threads", [0, -1, 257, 1.0, "2", None])
 def test_threads(threads):
-    with pytest.raises(ConfigError, match="threads = .*1..256"):
+    with pytest.raises(ConfigError, match=r"threads = .*1\.\.256"):
         SealCfg(threads=threads)
     assert SealCfg(threads=np.int64(2)).threads == 2
 

@@ -80,7 +80,7 @@ def test_the_end_itself_is_not_passed_before_it():
 
 def test_a_teleported_tip_moves_by_the_window_at_most():
     window = SealTaskCfg().window_m
-    jump = np.vstack((PATH[:50], PATH[-30:], PATH[-1:] + [-STEP, 0, 0]))
+    jump = np.vstack((PATH[:50], PATH[-30:], np.add(PATH[-1:], [-STEP, 0, 0])))
     progress, s = follow(jump)
     assert np.abs(np.diff(s)).max() <= window + 1e-12
     assert not progress.reached[0]
