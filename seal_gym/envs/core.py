@@ -154,10 +154,10 @@ class SealCore:
             i: Which simulation.
             rng: Draws pose, start and look, always in the same order.
         """
-        task, part = self.cfg.task, self.scene.workpiece
+        task = self.cfg.task
         shift = rng.uniform(-task.part_shift_m, task.part_shift_m, 2)
         yaw = rng.uniform(-task.part_yaw_rad, task.part_yaw_rad)
-        part_pose = part.pose @ yaw_pose(shift[0], shift[1], 0.0, yaw)
+        part_pose = self._reach.part_pose @ yaw_pose(shift[0], shift[1], 0.0, yaw)
         hovering = self._draw_hover(rng)
         q = ik.nearest(ik.solve(part_pose @ hovering), self._reach.start_q)
         self.arm.reset(i, q, part_pose)
@@ -362,8 +362,10 @@ class SealCore:
             result: Of its last step.
 
         Returns:
-            Outcome and metrics as protocol.md names them.
+            Outcome and metrics as protocol.md names them; ``rmse_mm`` is None if the tip did not come far
+            enough: a NaN would not equal itself where infos are compared.
         """
+        metrics = {k: None if np.isnan(v) else v for k, v in self.progress.metrics(i).items()}
         names = ("collision", "reached", "lost", "timeout")
         outcome = next((name for name in names if getattr(result, name)[i]), "running")
         return {
@@ -371,7 +373,7 @@ class SealCore:
             "reached": outcome == "reached",
             "collision": outcome == "collision",
             "timeout": outcome in ("timeout", "lost"),
-            **self.progress.metrics(i),
+            **metrics,
             "time_s": self.seconds(i),
         }
 

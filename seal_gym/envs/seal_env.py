@@ -98,8 +98,8 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     ``tip_error_mm``, ``progress`` (0..1), ``collision``, ``reached``, ``is_success``, ``renderer``,
     ``seam_velocity`` (estimated twist of the seam in the tip frame, m/s and rad/s), ``roi`` (the features by
     name with validity, in mm, rad and px), ``snr_db`` with images; at an episode's end ``episode_metrics``:
-    ``outcome``, ``reached``, ``collision``, ``timeout`` (lost included), ``rmse_mm``, ``rmse_whole_mm``,
-    ``coverage_pct``, ``time_s``.
+    ``outcome``, ``reached``, ``collision``, ``timeout`` (lost included), ``rmse_mm`` (None before 10 mm of
+    travel), ``rmse_whole_mm``, ``coverage_pct``, ``time_s``.
 
     ## Arguments
 

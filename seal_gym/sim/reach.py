@@ -32,11 +32,13 @@ class Reach(NamedTuple):
     """How the arm seals a part.
 
     Attributes:
+        part_pose: Nominal ``T_base_part``: the part's own, or a better one if the user gave none.
         start_q: Posture at the seam's start with the part in its nominal pose, shape (6,), rad.
         smallest_singular: Of the scaled Jacobian over all postures checked.
         joint_range: Smallest and largest joint angles met, shape (2, 6), rad.
     """
 
+    part_pose: Array
     start_q: Array
     smallest_singular: float
     joint_range: Array
@@ -70,6 +72,10 @@ def check_reach(scene: Scene, shift_m: float, yaw_rad: float) -> Reach:
     if isinstance(found, Reach):
         return found
     better = _better_pose(scene, displacements)
+    if better and not part.placed:
+        moved = _try(scene, yaw_pose(*better), displacements, _STEP_M)
+        if isinstance(moved, Reach):
+            return moved
     raise SeamError(
         f"workpiece {part.name!r} cannot be sealed by this cell: {found}. "
         + (
@@ -103,6 +109,7 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
         if not why:
             flat = q[:, :, b].reshape(-1, 6)
             return Reach(
+                part_pose=part_pose,
                 start_q=q[0, 0, b],
                 smallest_singular=fits[b].singular,
                 joint_range=np.stack((flat.min(axis=0), flat.max(axis=0))),

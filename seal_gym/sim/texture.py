@@ -22,9 +22,7 @@ _SCRATCHES = 140
 def _box(image: NDArray[np.int64], radius: int) -> NDArray[np.int64]:
     """Periodic (2 radius + 1)-square sum; integer, hence exact."""
     for axis in (0, 1):
-        image = sum(
-            (np.roll(image, k, axis) for k in range(-radius, radius + 1)), np.zeros_like(image)
-        )
+        image = sum((np.roll(image, k, axis) for k in range(-radius, radius + 1)), np.zeros_like(image))
     return image
 
 

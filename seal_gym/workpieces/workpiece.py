@@ -39,6 +39,7 @@ class Workpiece:
         surface: What cameras see.
         solids: What gun, arm and cameras can hit.
         pose: Nominal ``T_base_part`` [m]; each episode displaces it (see ``SealTaskCfg``).
+        placed: Whether the user chose the pose; if not, the environment takes another where this one fails.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Workpiece:
     surface: Surface
     solids: tuple[Solid, ...]
     pose: Array
+    placed: bool = True
 
     @classmethod
     def from_polyline(
@@ -73,7 +75,8 @@ class Workpiece:
             wall_height: Of a fillet's wall [m], 25-40 mm.
             groove_width: Of a groove [m], at most the mouth's diameter.
             pose: Nominal x, y, z [m] and yaw [rad] of the part's frame in the robot's base frame; by default
-                not turned, the plate on the table, the seam's middle 0.45 m in front of the robot.
+                not turned, the plate on the table, the seam's middle 0.45 m in front of the robot, or, if the
+                arm cannot seal it there, a place and an angle where it can.
 
         Returns:
             The workpiece.
@@ -91,7 +94,14 @@ class Workpiece:
         build = _fillet if joint == "fillet" else _groove
         size = wall_height if joint == "fillet" else groove_width
         surface, pieces = build(seam, size)
-        return cls(name=name, seam=seam, surface=surface, solids=tuple(pieces), pose=_place(pose, seam))
+        return cls(
+            name=name,
+            seam=seam,
+            surface=surface,
+            solids=tuple(pieces),
+            pose=_place(pose, seam),
+            placed=pose is not None,
+        )
 
     @classmethod
     def from_mesh(
@@ -115,7 +125,8 @@ class Workpiece:
             name: Shown in tables and pictures; the file's name by default.
             scale: Metres per unit of the file (0.001 for millimetres).
             pose: Nominal x, y, z [m] and yaw [rad] of the part's frame in the robot's base frame; by default
-                not turned, the plate on the table, the seam's middle 0.45 m in front of the robot.
+                not turned, the plate on the table, the seam's middle 0.45 m in front of the robot, or, if the
+                arm cannot seal it there, a place and an angle where it can.
 
         Returns:
             The workpiece. It collides as it looks, concave or not (``convex_pieces``).
@@ -144,6 +155,7 @@ class Workpiece:
             surface=Surface(triangles=triangles, material=material),
             solids=tuple(convex_pieces(triangles)),
             pose=_place(pose, curve),
+            placed=pose is not None,
         )
 
 

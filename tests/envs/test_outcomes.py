@@ -78,6 +78,8 @@ def test_driven_into_the_plate_is_a_collision(make, env_id):
     assert terminated and not truncated
     assert info["collision"] and not info["reached"] and not info["is_success"]
     assert flags(info) == ("collision", False, True, False)
+    assert info["episode_metrics"]["rmse_mm"] is None  # not NaN: infos must equal themselves
+    assert info["episode_metrics"]["coverage_pct"] < 5.0
     touching = {name for pair in env.unwrapped.core.arm.contacts(0) for name in pair}
     assert any("nozzle" in name for name in touching) and any("part" in name for name in touching)
     assert -RewardCfg().bound <= reward < -15

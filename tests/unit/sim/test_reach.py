@@ -2,6 +2,7 @@
 
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -136,3 +137,18 @@ def test_stations_are_close_where_the_seam_turns() -> None:
     tangent = seam.at(s).tangent
     turn = np.arccos(np.clip(np.sum(tangent[1:] * tangent[:-1], axis=1), -1.0, 1.0))
     assert np.rad2deg(turn).max() < 15.1
+
+
+def test_a_part_without_a_pose_is_put_where_it_can_be_sealed():
+    x = np.linspace(-0.12, 0.12, 25)
+    points = np.column_stack((x, 0.02 * np.sin(26.18 * x), 0 * x))
+    chosen = Workpiece.from_polyline(points, TO_RIGHT)
+    found = reach(chosen)
+    assert np.abs(found.part_pose - chosen.pose).max() > 0.01  # the default place does not do
+    with pytest.raises(SeamError, match="It can with pose="):
+        reach(Workpiece.from_polyline(points, TO_RIGHT, pose=(0.45, 0.0, -0.05, 0.0)))
+    env = gym.make("SealGym/Seal-v0", workpiece=chosen, disable_env_checker=True)
+    env.reset(seed=0)
+    shift = np.linalg.inv(found.part_pose) @ env.unwrapped.core.arm.part_pose[0]
+    assert np.abs(shift[:2, 3]).max() <= 0.02
+    assert np.arctan2(shift[1, 0], shift[0, 0]) == pytest.approx(0.0, abs=np.deg2rad(15.0))
