@@ -44,6 +44,8 @@ def same(a, b):
         assert a.keys() == b.keys()
         for key in b:
             same(a[key], b[key])
+    elif b is None:
+        assert a is None or np.isnan(a)  # an array of floats holds None as NaN
     else:
         assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_array_equal(a, b)
@@ -324,3 +326,16 @@ def test_render_shows_row_0(make_vec):
     single.reset(seed=0)
     np.testing.assert_array_equal(picture, single.render())
     single.close()
+
+
+def test_the_action_of_a_row_that_starts_anew_is_ignored(make_vec):
+    venv = make_vec(task=SHORT)
+    venv.reset(seed=0)
+    truncated = np.zeros(3, np.bool_)
+    while not truncated.all():
+        _, _, _, truncated, _ = venv.step(np.zeros((3, 6)))
+    observation, reward, terminated, truncated, _ = venv.step(np.full((3, 6), np.nan))
+    assert np.isfinite(observation).all()
+    assert not reward.any() and not (terminated | truncated).any()
+    with pytest.raises(ActionError):
+        venv.step(np.full((3, 6), np.nan))

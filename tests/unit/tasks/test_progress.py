@@ -199,3 +199,11 @@ def test_config_ranges(name):
 def test_config_other_ranges(kwargs):
     with pytest.raises(ConfigError, match=next(iter(kwargs))):
         SealTaskCfg(**kwargs)
+
+
+def test_going_back_before_10_mm_still_counts():
+    """``rmse_mm`` counts from the first time the tip has come 10 mm far."""
+    there = PATH[:13]
+    back = PATH[12:4:-1] + 2e-3 * OUT
+    metrics = follow(np.vstack((there, back)), SealTaskCfg(settle_m=9.5e-3))[0].metrics(0)
+    assert metrics["rmse_mm"] == pytest.approx(2.0 * np.sqrt(8 / 11), rel=1e-3)
