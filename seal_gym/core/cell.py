@@ -15,11 +15,15 @@ from seal_gym.core.paths import asset
 VIEWS = ("front", "side")
 
 
-def _positive(cfg: object, *names: str) -> None:
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _positive(cfg: Any, *names: str) -> None:
     for name in names:
         value = getattr(cfg, name)
         require(
-            np.isfinite(value) and value > 0,
+            _is_number(value) and value > 0,
             f"{type(cfg).__name__}.{name} = {value!r}: must be a finite number > 0",
         )
 
@@ -74,7 +78,7 @@ class CameraCfg:
         for field, length in (("position_mm", 3), ("target_mm", 3), ("up", 3), ("roi_px", 2), ("tip_px", 2)):
             value = getattr(self, field)
             require(
-                len(value) == length and bool(np.all(np.isfinite(value))),
+                isinstance(value, tuple) and len(value) == length and all(map(_is_number, value)),
                 f"CameraCfg.{field} = {value!r}: must be {length} finite numbers",
             )
         require(
@@ -207,6 +211,7 @@ class CellCfg:
 
 
 def _build(cls: type[Any], table: dict[str, Any], where: str) -> Any:
+    require(isinstance(table, dict), f"{where}: must be a section with keys, not {table!r}")
     names = {f.name for f in fields(cls)}
     unknown, missing = sorted(set(table) - names), sorted(names - set(table))
     require(not unknown, f"{where}: unknown {unknown}; the keys are {sorted(names)}")
@@ -234,8 +239,10 @@ def load_cell(path: Path | None = None) -> CellCfg:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from error
-    cameras = table.get("camera", {})
     sections = {"process": ProcessCfg, "timing": TimingCfg, "limits": LimitsCfg}
+    unknown = sorted(set(table) - {*sections, "camera"})
+    require(not unknown, f"{path.name}: unknown {unknown}; the sections are {[*sections, 'camera']}")
+    cameras = table.get("camera", {})
     for section in sections:
         require(section in table, f"{path.name}: section [{section}] missing")
     for view in VIEWS:

@@ -51,7 +51,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     | --- | --- | --- |
     | ``"tip"`` (default) | 6 | tip acceleration, d/dt of the body twist: 1 m/s^2, 25 rad/s^2 |
     | ``"rmp"`` | 27 | 6 f as above, then the 21 entries of A's lower Cholesky factor by rows, times 2 |
-    | ``"joint"`` | 6 | joint acceleration, 40 rad/s^2 |
+    | ``"joint"`` | 6 | joint acceleration, 15 rad/s^2 |
 
     With ``"rmp"`` the policy's leaf is resolved with fixed leaves: damping against the reference twist,
     regularisation, lean, joint limits, and any leaf passed as ``leaves`` or added with ``add_leaf``.

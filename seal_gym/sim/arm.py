@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from seal_gym.core.errors import PhysicsError
 from seal_gym.core.frames import Array, quat_from_matrix
-from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_UPPER
+from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_TORQUE, JOINT_UPPER
 from seal_gym.sim.scene import Scene
 
 
@@ -17,7 +17,7 @@ class ArmBatch:
     A commanded joint trajectory is integrated from the accelerations within the UR5's speed and position
     limits; gravity-compensated position servos (``assets/ur5_sealgun/ur5.xml``) follow it within the real
     torque limits. The servo's target leads the trajectory by (kv / kp) qd, which cancels the lag of its
-    damping.
+    damping. Where the torque does not suffice the trajectory waits for the arm.
 
     Attributes:
         q: Joint angles, shape (N, 6), rad; a live view of the simulation.
@@ -54,6 +54,8 @@ class ArmBatch:
         self._t_start = self._t_end - scene.cell.timing.step_s
         kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
         self._lead = kv / kp
+        # Leads at which position and speed servo alone ask for all the torque there is: more is windup.
+        self._pull_q, self._pull_qd = JOINT_TORQUE / kp, JOINT_TORQUE / kv
         self._contact = {"ncon": np.zeros((n, steps), np.int32)}
 
     def reset(self, i: int, q: Array, part_pose: Array) -> None:
@@ -93,14 +95,16 @@ class ArmBatch:
             PhysicsError: If MuJoCo reports an error.
         """
         dt = self._dt
-        speed = np.clip(self.qd_command + qdd * dt, -JOINT_SPEED, JOINT_SPEED)
-        reached = self.q_command + 0.5 * (self.qd_command + speed) * dt
+        q = np.minimum(np.maximum(self.q_command, self.q - self._pull_q), self.q + self._pull_q)
+        qd = np.minimum(np.maximum(self.qd_command, self.qd - self._pull_qd), self.qd + self._pull_qd)
+        speed = np.minimum(np.maximum(qd + qdd * dt, -JOINT_SPEED), JOINT_SPEED)
+        reached = q + 0.5 * (qd + speed) * dt
         stopped = (reached < JOINT_LOWER) | (reached > JOINT_UPPER)
         if stopped.any():
             reached = np.clip(reached, JOINT_LOWER, JOINT_UPPER)
             speed = np.where(stopped, 0.0, speed)
-        acceleration = (speed - self.qd_command) / dt
-        start, rate = self.q_command[:, None], self.qd_command[:, None]
+        acceleration = (speed - qd) / dt
+        start, rate = q[:, None], qd[:, None]
         t, a = self._t_start, acceleration[:, None]
         target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + self._t_end * a)
         try:

@@ -76,7 +76,8 @@ def reward(
         travel_steps: Travel along the seam in units of the nominal speed times a frame, shape (N,).
         error_m: Tip error [m], shape (N,).
         previous_error_m: Tip error a frame ago [m], shape (N,).
-        heading_rad: Angle between the tip's y axis and the seam [rad], shape (N,).
+        heading_rad: Angle between the tip's y axis and the seam in the frame the action was chosen on [rad],
+            shape (N,).
         action_change: Mean absolute change of the action, halved, 0..1, shape (N,).
         reached: Whether the episode ended with the seam sealed, shape (N,).
         failed: Whether it ended with a collision or lost, shape (N,).

@@ -58,7 +58,7 @@ def test_tip_acceleration_is_realised_along_its_axis(make, axis, sign):
 def test_joint_acceleration_is_realised(make, joint):
     env = make(control="joint")
     action = np.zeros(6, np.float32)
-    action[joint] = 0.1
+    action[joint] = 4.0 / 15.0
     env.reset(seed=0)
     q = env.unwrapped.core.arm.q[0].copy()
     for _ in range(3):
@@ -230,7 +230,9 @@ def test_joint_and_speed_limits_hold_under_extreme_joint_actions():
         assert (q >= JOINT_LOWER - 0.06).all() and (q <= JOINT_UPPER + 0.06).all()
         fastest = np.maximum(fastest, np.abs(arm.qd_command).max(axis=0))
     np.testing.assert_allclose(fastest, JOINT_SPEED)
-    for i, j in enumerate([*range(6), *range(6)]):  # at the stop, and at rest there
+    assert clear[:12].sum() >= 4
+    for i in np.flatnonzero(clear[:12]):  # at the stop, and at rest there, unless something was in the way
+        j = i % 6
         stop = JOINT_UPPER[j] if i < 6 else JOINT_LOWER[j]
         assert core.arm.q_command[i, j] == stop
         assert core.arm.qd_command[i, j] == 0.0
@@ -252,4 +254,4 @@ def test_full_actions_keep_every_number_finite(control):
 
 def test_limits_come_from_the_cell():
     limits = load_cell().limits
-    assert (limits.linear_m_s2, limits.angular_rad_s2, limits.joint_rad_s2) == (1.0, 25.0, 40.0)
+    assert (limits.linear_m_s2, limits.angular_rad_s2, limits.joint_rad_s2) == (1.0, 25.0, 15.0)

@@ -171,3 +171,21 @@ def test_what_is_up_and_right_in_the_images():
     # 0.2-0.4 mm per pixel at the seam.
     for step in (front[0], front[1], side[0]):
         assert 0.2 < 1.0 / np.linalg.norm(step) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("speed_m_s = 0.010", 'speed_m_s = "fast"', r"speed_m_s = 'fast'.*finite number > 0"),
+        ("focal_px = 400.0", "focal_px = true", r"focal_px = True"),
+        ("up = [0.0, 1.0, 0.0]", "up = 1.0", r"up = 1\.0: must be 3 finite numbers"),
+        ("[process]", "[robot]\nname = 'x'\n[process]", r"unknown \['robot'\]; the sections are"),
+    ],
+)
+def test_wrong_types_and_sections_are_named(tmp_path, old, new, message):
+    text = asset("ur5_sealgun", "cell.toml").read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "cell.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        load_cell(path)

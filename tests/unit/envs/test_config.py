@@ -65,4 +65,4 @@ def test_adapter_errors():
 
 def test_joint_adapter_scales():
     out = JointAdapter(SealCfg().cell)(np.array([[0.5, -1, 0, 0, 0, 1.0]]), None)
-    np.testing.assert_array_equal(out, [[20, -40, 0, 0, 0, 40]])
+    np.testing.assert_array_equal(out, [[7.5, -15, 0, 0, 0, 15]])

@@ -121,3 +121,21 @@ def test_it_is_mujocos_own_step():
         data.ctrl[:] = START + 0.5 * qdd * start**2 + lead * qdd * end
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(batch.q[0], data.qpos, atol=1e-12)
+
+
+def test_a_command_waits_for_an_arm_without_the_torque_for_it():
+    """All joints full ahead and back, beyond the motors: the command stays within the servos' pull."""
+    model = cached_scene(catalogue.get("flat"), CELL).model
+    kp, kv = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    batch, rng = arms(), np.random.default_rng(0)
+    furthest = 0.0
+    for k in range(60):
+        if k % 6 == 0:
+            qdd = rng.choice([-30.0, 30.0], (1, 6))
+        before, speed = batch.q.copy(), np.abs(batch.qd[0]) + JOINT_TORQUE / kv
+        batch.step(qdd)
+        # From within the pull of where the arm was, one frame on at no more than its speed or the limit.
+        lead = np.abs(batch.q_command - before)[0] - JOINT_TORQUE / kp
+        assert np.all(lead <= np.maximum(speed, JOINT_SPEED) * DT + 1e-9)
+        furthest = max(furthest, np.abs(batch.q_command - batch.q).max())
+    assert furthest > 1e-3  # the motion was indeed too much for it
