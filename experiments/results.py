@@ -159,12 +159,24 @@ def write(
         "rows": rows,
         "trials": trials,
     }
-    (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (out / f"{name}.json").write_text(_document(document), encoding="utf-8")
     with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     (out / f"{name}.md").write_text(table(rows, markdown=True) + "\n", encoding="utf-8")
+
+
+def _document(document: dict[str, Any]) -> str:
+    """JSON with a line for each key, row and trial, so that changes can be read as a diff."""
+    parts = []
+    for key, value in document.items():
+        if isinstance(value, list):
+            lines = ",\n  ".join(json.dumps(item) for item in value)
+            parts.append(f" {json.dumps(key)}: [\n  {lines}\n ]")
+        else:
+            parts.append(f" {json.dumps(key)}: {json.dumps(value)}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
 def _number(value: float | None, digits: int) -> str:
