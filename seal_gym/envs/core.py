@@ -285,9 +285,13 @@ class SealCore:
         )
         return StepResult(value, reached, touched, lost, timeout)
 
-    def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
+    def _seam_lines(self) -> SeamLines:
+        """The one place where perception differs: the oracle projects the true seam into the views."""
         point, tangent = seam_in_world(self._seam, self.progress.s, self.arm.part_pose)
-        self.lines = oracle_lines(point, tangent, self.tip.pose, self._views)
+        return oracle_lines(point, tangent, self.tip.pose, self._views)
+
+    def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
+        self.lines = self._seam_lines()
         update_features(self.features, self.lines, self._views)
         self._rate.update(
             self.features.point_m,
