@@ -53,9 +53,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder (default: %(default)s)")
     parser.add_argument("--no-video", action="store_true", help="no videos; the plots need no OpenGL")
     options = parser.parse_args(arguments)
-    for name in ("trials", "jobs"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least 1")
+    for name, least in (("trials", 1), ("jobs", 1), ("seed", 0)):
+        if getattr(options, name) < least:
+            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
+    if options.seam and options.seam.suffix != ".csv":
+        parser.error(f"--seam {options.seam}: must be a .csv file with rows x,y,z,ax,ay,az in m")
+    if options.out.exists() and not options.out.is_dir():
+        parser.error(f"--out {options.out}: is a file, must be a folder")
     return options
 
 
@@ -68,7 +72,7 @@ def parts(options: argparse.Namespace) -> list[str]:
     Returns:
         Names and seam files, for ``Trial.workpiece``.
     """
-    chosen = list(options.workpiece or ([] if options.seam else NAMES))
+    chosen = list(dict.fromkeys(options.workpiece or ([] if options.seam else NAMES)))
     if options.seam:
         chosen.append(str(options.seam))
     elif not options.workpiece:

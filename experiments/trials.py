@@ -1,5 +1,6 @@
 """Runs trials: one policy, one workpiece, one seed each; in parallel, resumable, the same in any order."""
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -16,8 +17,10 @@ from tqdm import tqdm
 
 import agents
 import seal_gym
+from experiments import results
 from seal_gym.core.errors import SeamError
 from seal_gym.envs.seal_env import SealEnv
+from seal_gym.workpieces.catalogue import NAMES
 from seal_gym.workpieces.workpiece import Workpiece
 
 Observer = Callable[[SealEnv, dict[str, Any]], None]
@@ -41,8 +44,11 @@ class Trial:
 
     @property
     def part(self) -> str:
-        """Short name of the workpiece."""
-        return Path(self.workpiece).stem if self.workpiece.endswith(".csv") else self.workpiece
+        """Short name of the workpiece; a seam file's never that of a nominal part."""
+        if not self.workpiece.endswith(".csv"):
+            return self.workpiece
+        stem = Path(self.workpiece).stem
+        return f"{stem}_csv" if stem in NAMES else stem
 
     def spec(self) -> dict[str, Any]:
         """Enough to rebuild the run.
@@ -78,21 +84,29 @@ def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     if not path.is_file():
         raise SeamError(f"seam file {str(path)!r} not found: give a CSV file with rows x,y,z,ax,ay,az")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SeamError(f"seam file {path.name!r} is no text file: {error}") from error
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    header = False
+    for number, line in enumerate(text.splitlines(), start=1):
         cells = line.split("#")[0].replace(",", " ").split()
-        if not cells or (not rows and any(c.isalpha() and c not in "eE" for c in "".join(cells))):
+        values = [_number(c) for c in cells]
+        if not cells:
             continue
-        try:
-            row = [float(c) for c in cells]
-        except ValueError:
-            row = []
-        if len(row) != 6:
+        if not rows and not header and all(v is None for v in values):
+            header = True
+            continue
+        row = [v for v in values if v is not None]
+        if len(row) != 6 or len(cells) != 6:
             raise SeamError(
                 f"{path.name} line {number}: {line.strip()!r} has not six numbers; write x,y,z,ax,ay,az with "
                 "the point in m and the unit approach direction (e.g. 0.10,0,0,0,-0.7071,0.7071)"
             )
         rows.append(row)
+    if len(rows) < 2:
+        raise SeamError(f"seam file {path.name!r} has {len(rows)} points: at least 2")
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
     direction = table[:, 3:]
     length = np.linalg.norm(direction, axis=1, keepdims=True)
@@ -101,6 +115,25 @@ def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
         np.abs(length - 1.0) < 0.02, direction / np.where(length > 0, length, 1.0), direction
     )
     return table[:, :3], direction
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+@lru_cache(maxsize=1)
+def _code() -> str:
+    """Hash of everything a trial runs on besides its specification: sources, assets and packages."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256(json.dumps(results.stack(), sort_keys=True).encode())
+    for folder in ("agents", "assets", "experiments", "seal_gym"):
+        for file in sorted((root / folder).rglob("*")):
+            if file.suffix in (".py", ".xml", ".toml"):
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=32)
@@ -174,7 +207,8 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
     Args:
         trials: What to run.
         jobs: Processes.
-        log: A file of JSON lines; what is in it with the same specification is not run again.
+        log: A file of JSON lines; what is in it with the same specification, from the same code and
+            packages, is not run again.
         title: Of the progress bar.
 
     Returns:
@@ -192,7 +226,7 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
             unit="trial",
         ):
             done[_key(row["method"], row["env_spec"])] = row
-            file.write(json.dumps(row) + "\n")
+            file.write(json.dumps({"code": _code(), **row}) + "\n")
             file.flush()
     return [done[_key(t.method, t.spec())] for t in wanted]
 
@@ -225,5 +259,7 @@ def _read_log(log: Path) -> dict[str, dict[str, Any]]:
             row = json.loads(line)
         except json.JSONDecodeError:
             continue  # the line a killed run was writing
+        if row.pop("code", None) != _code():
+            continue  # another version's
         rows[_key(row["method"], row["env_spec"])] = row
     return rows

@@ -8,22 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from seal_gym.core.errors import ConfigError, require
+from seal_gym.core.errors import ConfigError, is_number, require
 from seal_gym.core.frames import Array, normalise
 from seal_gym.core.paths import asset
 
 VIEWS = ("front", "side")
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
 def _positive(cfg: Any, *names: str) -> None:
     for name in names:
         value = getattr(cfg, name)
         require(
-            _is_number(value) and value > 0,
+            is_number(value) and value > 0,
             f"{type(cfg).__name__}.{name} = {value!r}: must be a finite number > 0",
         )
 
@@ -78,7 +74,7 @@ class CameraCfg:
         for field, length in (("position_mm", 3), ("target_mm", 3), ("up", 3), ("roi_px", 2), ("tip_px", 2)):
             value = getattr(self, field)
             require(
-                isinstance(value, tuple) and len(value) == length and all(map(_is_number, value)),
+                isinstance(value, tuple) and len(value) == length and all(map(is_number, value)),
                 f"CameraCfg.{field} = {value!r}: must be {length} finite numbers",
             )
         require(

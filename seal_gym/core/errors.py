@@ -1,5 +1,8 @@
 """The package's errors: one base class, so that a caller can catch all of them at once."""
 
+import math
+import numbers
+
 
 class SealGymError(Exception):
     """Base of every error this package raises on purpose."""
@@ -23,6 +26,18 @@ class RenderError(SealGymError, RuntimeError):
 
 class PhysicsError(SealGymError, RuntimeError):
     """The physics engine reported an error or produced a state that is not finite."""
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a finite number; True and False are none.
+
+    Args:
+        value: Anything a user may have passed.
+
+    Returns:
+        Whether it is.
+    """
+    return not isinstance(value, bool) and isinstance(value, numbers.Real) and math.isfinite(value)
 
 
 def require(condition: bool, message: str, error: type[SealGymError] = ConfigError) -> None:

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from seal_gym.core.cell import CellCfg, LimitsCfg
-from seal_gym.core.errors import ConfigError
+from seal_gym.core.errors import ActionError, ConfigError, require
 from seal_gym.core.frames import Array
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, TipKinematics
 from seal_gym.rmp import (
@@ -134,8 +134,37 @@ class RmpAdapter:
         leaves = [on_tip(accel, metric, jacobian, drift)]
         leaves += [on_tip(*policy, jacobian, drift) for policy in fixed]
         leaves.append(joint_limits(state.q, state.qd, JOINT_LOWER, JOINT_UPPER))
-        leaves += [leaf(state) for leaf in self.leaves]
+        leaves += [_checked_leaf(leaf, state) for leaf in self.leaves]
         return resolve(leaves, jacobian)
+
+
+def _checked_leaf(function: LeafFunction, state: ArmState) -> Leaf:
+    """A user's leaf, or a word on what is wrong with it before it reaches the arm."""
+    name = getattr(function, "__name__", repr(function))
+    leaf = function(state)
+    require(
+        isinstance(leaf, Leaf), f"leaf {name!r} gave {leaf!r}: must give a seal_gym.rmp.Leaf", ActionError
+    )
+    for field, values in zip(Leaf._fields, leaf, strict=True):
+        require(
+            bool(np.isfinite(values).all()),
+            f"leaf {name!r} gave a value of {field} that is not finite: give finite numbers, a zero metric "
+            "where it has nothing to say",
+            ActionError,
+        )
+    return leaf
+
+
+def check_leaf_function(leaf: object) -> None:
+    """Refuses what cannot be a leaf.
+
+    Args:
+        leaf: What the user passed.
+
+    Raises:
+        ConfigError: If it cannot be called.
+    """
+    require(callable(leaf), f"leaf = {leaf!r}: must be a function of an ArmState that gives a Leaf")
 
 
 class JointAdapter:

@@ -7,7 +7,7 @@ import numpy as np
 
 from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.errors import ConfigError, require
-from seal_gym.envs.adapters import CONTROLS, LeafFunction
+from seal_gym.envs.adapters import CONTROLS, LeafFunction, check_leaf_function
 from seal_gym.sim.look import LookCfg
 from seal_gym.tasks.progress import SealTaskCfg
 from seal_gym.tasks.reward import RewardCfg
@@ -53,6 +53,7 @@ class SealCfg:
         perception: ``"oracle"``: the ROI features from the true geometry through the calibrated cameras.
         observation: ``"features"`` or ``"features+images"``.
         renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
+        sealant: ``False``: this version simulates the gun's motion, not the sealant.
         leaves: Extra RMP leaves resolved with the policy's, with ``control="rmp"``.
         task: Outcomes and displacements.
         reward: Weights of the reward.
@@ -66,6 +67,7 @@ class SealCfg:
     perception: str = "oracle"
     observation: str = "features"
     renderer: str = "raycast"
+    sealant: bool = False
     leaves: tuple[LeafFunction, ...] = ()
     task: SealTaskCfg = field(default_factory=SealTaskCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
@@ -76,6 +78,16 @@ class SealCfg:
     def __post_init__(self) -> None:
         """Checks the choices."""
         catalogue.get(self.workpiece)
+        kinds = {"task": SealTaskCfg, "reward": RewardCfg, "look": LookCfg, "cell": CellCfg}
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            require(isinstance(value, kind), f"{name} = {value!r}: must be a {kind.__name__}")
+        require(
+            isinstance(self.leaves, tuple | list), f"leaves = {self.leaves!r}: must be a tuple of functions"
+        )
+        for leaf in self.leaves:
+            check_leaf_function(leaf)
+        require(self.sealant is False, f"sealant = {self.sealant!r}: no sealant is simulated in this version")
         _one_of("control", self.control, CONTROLS)
         _one_of("perception", self.perception, PERCEPTIONS)
         _one_of("observation", self.observation, OBSERVATIONS)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import ActionError, ConfigError
 from seal_gym.core.frames import Array, axis_angle, tip_rotation, transform, yaw_pose
 from seal_gym.core.kinematics import TipKinematics, tip_kinematics
-from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, make_adapter
+from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, check_leaf_function, make_adapter
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.sensors import Sensors
 from seal_gym.estimation.seam_rate import SeamRate
@@ -205,7 +205,7 @@ class SealCore:
         qdd = self.adapter(action, self._arm_state())
         touched = self.arm.step(qdd)
         self._track(qdd)
-        before, error = self.progress.s.copy(), self.progress.error_m.copy()
+        before, error = self.progress.furthest, self.progress.error_m.copy()
         self.progress.advance(self._tip_in_part())
         self.frames += 1
         return self._judge(touched, action, before, error)
@@ -230,12 +230,7 @@ class SealCore:
     # -- the parts of a step ----------------------------------------------------------------------------
 
     def _checked(self, action: NDArray[Any]) -> Array:
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (self.n, self.adapter.size):
-            raise ActionError(
-                f"action has shape {action.shape}: control={self.cfg.control!r} takes "
-                f"{(self.n, self.adapter.size) if self.n > 1 else (self.adapter.size,)}"
-            )
+        action = as_action(action, (self.n, self.adapter.size), self.cfg.control)
         if not np.isfinite(action).all():
             bad = np.argwhere(~np.isfinite(action))[0].tolist()
             raise ActionError(
@@ -274,7 +269,7 @@ class SealCore:
         change = 0.5 * np.abs(action - self._action).mean(axis=1)
         self._action = action
         value = reward(
-            (progress.s - before) / (cell.process.speed_m_s * cell.timing.frame_s),
+            (progress.furthest - before) / (cell.process.speed_m_s * cell.timing.frame_s),
             progress.error_m,
             error,
             np.abs(self.features.theta_rad).max(axis=1),
@@ -342,9 +337,11 @@ class SealCore:
 
         Raises:
             ActionError: If the control mode resolves no leaves.
+            ConfigError: If it is no function.
         """
         if not isinstance(self.adapter, RmpAdapter):
             raise ActionError(f"control = {self.cfg.control!r} resolves no leaves: use control='rmp'")
+        check_leaf_function(leaf)
         self.adapter.leaves.append(leaf)
 
     def seconds(self, i: int) -> float:
@@ -409,6 +406,31 @@ class SealCore:
         if result is not None and (result.terminated[i] or result.timeout[i]):
             info["episode_metrics"] = self.episode_metrics(i, result)
         return info
+
+
+def as_action(action: Any, shape: tuple[int, ...], control: str) -> Array:
+    """An action as an array of numbers, whatever the user passed.
+
+    Args:
+        action: Numbers.
+        shape: What it must be.
+        control: Named in the error.
+
+    Returns:
+        Of that shape.
+
+    Raises:
+        ActionError: If it is something else.
+    """
+    try:
+        array = np.asarray(action)
+        real = array.dtype.kind in "biuf" or (array.dtype == object and array.astype(np.float64) is not None)
+    except (TypeError, ValueError):
+        array, real = np.empty(0), False
+    if not real or array.shape != shape:
+        given = f"shape {array.shape}" if real else f"no real numbers ({type(action).__name__})"
+        raise ActionError(f"action has {given}: control={control!r} takes numbers of shape {shape}")
+    return array.astype(np.float64)
 
 
 def roi_info(f: RoiFeatures, i: int) -> dict[str, float | bool]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import ConfigError
 from seal_gym.envs.adapters import LeafFunction
 from seal_gym.envs.config import SealCfg
-from seal_gym.envs.core import Observation, SealCore, StepResult
+from seal_gym.envs.core import Observation, SealCore, StepResult, as_action
 from seal_gym.envs.viewing import SceneView, check_render_mode
 
 
@@ -83,7 +83,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ## Reward
 
-    See ``seal_gym.tasks.reward``: travel along the seam in nominal steps (at most +-1) times the tracking
+    See ``seal_gym.tasks.reward``: new ground along the seam in nominal steps (at most 1) times the tracking
     quality 1 / (1 + (e / 1 mm)^2), a potential of the tip error, small penalties for heading error and for
     jumps of the action, +20 for a sealed seam and -20 for a collision or a lost seam. Bounded by +-23.15.
 
@@ -91,7 +91,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ``terminated``: *reached* (past the end within 5 mm, 95 % of the seam visited within 5 mm), *collision*
     (the first contact of gun, arm or cameras with part, table or each other), *lost* (25 mm off the path).
-    ``truncated``: *timeout* (3x the nominal time).
+    ``truncated``: *timeout* (3x the nominal time). Steps after the end without a ``reset`` earn nothing.
 
     ## Info
 
@@ -131,7 +131,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         self.action_space = self.core.action_space
         self.observation_space = self.core.observation_space
         self._view = SceneView(self.core) if render_mode else None
-        self._running = False
+        self._running = self._ended = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -153,7 +153,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
             raise ConfigError(f"options = {options!r}: reset takes none in this version")
         self.core.reset(0, self.np_random)
         observation = first(self.core.observe())
-        self._running = True
+        self._running, self._ended = True, False
         self._show()
         return observation, self.core.info(0, None)
 
@@ -172,15 +172,17 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         """
         if not self._running:
             raise gym.error.ResetNeeded("call reset() before step()")
-        result: StepResult = self.core.step(np.asarray(action)[None])
-        observation = first(self.core.observe())
+        core = self.core
+        result: StepResult = core.step(as_action(action, (core.adapter.size,), core.cfg.control)[None])
+        ended, self._ended = self._ended, self._ended or bool(result.terminated[0] or result.timeout[0])
+        observation = first(core.observe())
         self._show()
         return (
             observation,
-            float(result.reward[0]),
+            0.0 if ended else float(result.reward[0]),
             bool(result.terminated[0]),
             bool(result.timeout[0]),
-            self.core.info(0, result),
+            core.info(0, result),
         )
 
     def add_leaf(self, leaf: LeafFunction) -> None:

@@ -163,12 +163,17 @@ class SealVectorEnv(VectorEnv, EzPickle):
 
     # -- seeds and options ------------------------------------------------------------------------------
 
-    def _seeds(self, seed: int | list[int | None] | None) -> list[int | None]:
+    def _seeds(self, seed: Any) -> list[int | None]:
         n = self.num_envs
         if seed is None:
             return [None] * n
         if isinstance(seed, int | np.integer):
             return [int(seed) + i for i in range(n)]
+        require(
+            isinstance(seed, list | tuple)
+            and all(s is None or isinstance(s, int | np.integer) for s in seed),
+            f"seed = {seed!r}: must be a whole number or a list of them, one a row",
+        )
         require(len(seed) == n, f"seed has {len(seed)} entries: must be one number or {n}, one a row")
         return [None if s is None else int(s) for s in seed]
 

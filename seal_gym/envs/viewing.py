@@ -1,5 +1,7 @@
 """What people look at: a third-person picture with the ROIs as insets, or MuJoCo's viewer."""
 
+import os
+import sys
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -186,6 +188,14 @@ class SceneView:
         """
         core = self._core
         if self._viewer is None:
+            # GLFW ends the process where it finds no screen: ask before.
+            if sys.platform == "linux" and not (
+                os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+            ):
+                raise RenderError(
+                    'render_mode="human" needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set: use '
+                    'render_mode="rgb_array"'
+                )
             from mujoco import viewer  # loads GLFW: only with a screen
 
             self._viewer_data = mujoco.MjData(core.scene.model)

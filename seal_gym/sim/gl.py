@@ -16,7 +16,10 @@ from seal_gym.sim.scene import GROUP_COLLISION, GROUP_FURNITURE, GROUP_ROBOT, GU
 
 # Averaged down to the ROI: multisampling alone leaves edges a tenth of a pixel rough.
 _SUPERSAMPLE = 4
-HELP = "install libegl1 libgl1 libgl1-mesa-dri and set MUJOCO_GL=egl before the first import of mujoco"
+HELP = (
+    "set MUJOCO_GL=egl before the first import of mujoco, and install libegl1 libgl1 libgl1-mesa-dri if they "
+    "are missing"
+)
 
 
 def offscreen(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:

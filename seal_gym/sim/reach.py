@@ -1,5 +1,6 @@
 """Whether the arm can seal a part: every posture along the seam, at every displacement of the part."""
 
+import copy
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
@@ -22,6 +23,9 @@ _LENGTH_M = 0.25
 _TURN_RAD = np.deg2rad(15.0)
 # From station to station no joint turns as far, unless the branch ends in between.
 _JUMP_RAD = 1.0
+# Beside the part stations lie closer together, and the gun needs room for what the tip's path is off.
+_CLOSER = 4
+_ROOM_M = 2e-4
 _ELBOW_UP = 5
 _PART_PREFIX = "col_part"
 _TRY_DISTANCE_M = (0.45, 0.35, 0.40, 0.50)
@@ -91,10 +95,10 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
     """How the arm seals the part at a nominal pose, or why it cannot."""
     seam = scene.workpiece.seam
     s = _stations(seam, step_m)
-    p, t, a = seam.at(s)
-    tip = transform(tip_rotation(t, a), p + scene.cell.process.stand_off_m * a)
     displaced = part_pose @ displacements
-    q = np.unwrap(ik.solve(displaced[:, None] @ tip[None]), axis=1)  # (displacement, station, branch, joint)
+    q = np.unwrap(
+        ik.solve(displaced[:, None] @ _tip_poses(scene, s)[None]), axis=1
+    )  # (displacement, station, branch, joint)
     # A whole turn more or less keeps the posture: bring the middle of each joint's travel near zero.
     q -= 2 * np.pi * np.round((q.max(axis=1, keepdims=True) + q.min(axis=1, keepdims=True)) / (4 * np.pi))
     fits = [_fit(q[:, :, b], s) for b in range(ik.BRANCHES)]
@@ -105,7 +109,7 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
     for b in order:
         if fits[b].why:
             continue
-        why = _touching(scene, q[:, :, b], displaced, s)
+        why = _touching(scene, q[:, :, b], displaced, s) or _tight(scene, part_pose, b, step_m)
         if not why:
             flat = q[:, :, b].reshape(-1, 6)
             return Reach(
@@ -122,8 +126,8 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
 
 def _stations(seam: Seam, step_m: float) -> Array:
     """Arc lengths to look at: closer together where the seam turns, so that no joint turns far in between."""
-    turn = np.linalg.norm(np.diff(seam.tangent, axis=0), axis=1)
-    effort = np.concatenate(([0.0], np.cumsum(np.diff(seam.arc) / step_m + turn / _TURN_RAD)))
+    turn = np.linalg.norm(np.diff(seam.tangent, axis=0), axis=1) * _STEP_M / _TURN_RAD
+    effort = np.concatenate(([0.0], np.cumsum((np.diff(seam.arc) + turn) / step_m)))
     first, last = np.interp([0.0, seam.length], seam.arc, effort)
     s = np.interp(np.linspace(first, last, int(np.ceil(last - first)) + 1), effort, seam.arc)
     s[[0, -1]] = 0.0, seam.length
@@ -181,9 +185,30 @@ def _fit(q: Array, s: Array) -> _Fit:
     return _Fit("", float(smallest.min()))
 
 
-def _touching(scene: Scene, q: Array, displaced: Array, s: Array) -> str:
-    """The first contact along the seam; empty if there is none."""
+def _tight(scene: Scene, part_pose: Array, branch: int, step_m: float) -> str:
+    """The first place, looked at closely, where the gun has no room beside the part; empty if there is none.
+
+    Gun and part are rigid, so that this does not depend on where the part stands.
+    """
+    s = _stations(scene.workpiece.seam, step_m / _CLOSER)
+    q = ik.solve(part_pose @ _tip_poses(scene, s))[:, branch]
+    if np.isnan(q).any():
+        return ""  # at the edge of the reach: the coarser check has judged it
+    return _touching(scene, q[None], part_pose[None], s, _ROOM_M)
+
+
+def _tip_poses(scene: Scene, s: Array) -> Array:
+    """``T_part_tip`` of the desired motion at arc lengths, shape (n, 4, 4)."""
+    p, t, a = scene.workpiece.seam.at(s)
+    return transform(tip_rotation(t, a), p + scene.cell.process.stand_off_m * a)
+
+
+def _touching(scene: Scene, q: Array, displaced: Array, s: Array, room_m: float = 0.0) -> str:
+    """The first place along the seam where geoms come closer than ``room_m``; empty if there is none."""
     model = scene.model
+    if room_m:
+        model = copy.copy(model)
+        model.geom_margin[:] = room_m
     data = mujoco.MjData(model)
     for pose, postures in zip(displaced, q, strict=True):
         data.mocap_pos[0] = pose[:3, 3]

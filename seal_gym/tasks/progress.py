@@ -106,6 +106,7 @@ class Progress:
     Attributes:
         s: Arc length of the path's point nearest the tip, found locally: it moves by at most the window in
             a frame, so it never jumps to another side, shape (N,), m.
+        furthest: The largest ``s`` of the episode, shape (N,), m.
         error_m: Distance from the tip to the nearest point of the desired path, shape (N,), m.
         off_path_m: Distance to the path's point at ``s``, shape (N,), m.
     """
@@ -123,6 +124,7 @@ class Progress:
         self._path = seam.tip_path(stand_off_m)
         bins = int(np.ceil(seam.length / _BIN_M))
         self.s = np.zeros(n)
+        self.furthest = np.zeros(n)
         self.error_m = np.zeros(n)
         self.off_path_m = np.zeros(n)
         self._visited = np.zeros((n, bins), np.bool_)
@@ -141,7 +143,7 @@ class Progress:
         self._visited[i] = self._covered[i] = False
         self._sums[i], self._settled[i] = 0.0, False
         self.off_path_m[i], self.s[i] = self.locate(tip)
-        self.error_m[i] = self.off_path_m[i]
+        self.error_m[i], self.furthest[i] = self.off_path_m[i], self.s[i]
 
     def locate(self, tip: Array) -> tuple[float, float]:
         """The path's point nearest a tip at the start.
@@ -177,6 +179,7 @@ class Progress:
             self._visited,
             self._covered,
         )
+        self.furthest = np.maximum(self.furthest, self.s)
         self._settled |= self.s >= cfg.settle_m
         squared = self.error_m**2
         self._sums[:, 0] += squared * self._settled

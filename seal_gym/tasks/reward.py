@@ -14,7 +14,7 @@ class RewardCfg:
     """Weights and scales of the reward's terms; every term but the outcome is bounded by its weight.
 
     Attributes:
-        progress: Weight of the travel along the seam, in nominal steps, times the tracking quality.
+        progress: Weight of the new ground along the seam, in nominal steps, times the tracking quality.
         approach: Weight of the change of the tip error's potential.
         heading: Weight of the heading error.
         smoothness: Weight of the change of the action.
@@ -55,7 +55,7 @@ class RewardCfg:
 
 
 def reward(
-    travel_steps: Array,
+    ground_steps: Array,
     error_m: Array,
     previous_error_m: Array,
     heading_rad: Array,
@@ -66,14 +66,14 @@ def reward(
 ) -> Array:
     """Reward of one step.
 
-    r = w_p clip(travel, -1, 1) q + w_a (P(e') - P(e)) - w_h min(1, |theta| / theta_0) - w_s c
+    r = w_p clip(ground, 0, 1) q + w_a (P(e') - P(e)) - w_h min(1, |theta| / theta_0) - w_s c
         + [reached] w_r - [failed] w_f,
-    with the quality q = 1 / (1 + (e / e_0)^2) for forward travel (1 for travel back, so that going to and
-    fro never pays), the potential P(e) = e / (e + e_P) and the mean absolute change of action c, halved to
-    0..1.
+    with the quality q = 1 / (1 + (e / e_0)^2), the potential P(e) = e / (e + e_P) and the mean absolute
+    change of action c, halved to 0..1. Only ground that no earlier frame of the episode had reached counts:
+    neither going to and fro nor hurrying pays.
 
     Args:
-        travel_steps: Travel along the seam in units of the nominal speed times a frame, shape (N,).
+        ground_steps: New ground along the seam in units of the nominal speed times a frame, shape (N,).
         error_m: Tip error [m], shape (N,).
         previous_error_m: Tip error a frame ago [m], shape (N,).
         heading_rad: Angle between the tip's y axis and the seam in the frame the action was chosen on [rad],
@@ -86,12 +86,12 @@ def reward(
     Returns:
         Shape (N,), within +-``cfg.bound``.
     """
-    travel = np.minimum(np.maximum(travel_steps, -1.0), 1.0)
-    quality = np.where(travel > 0, 1.0 / (1.0 + (error_m / cfg.error_m) ** 2), 1.0)
+    ground = np.minimum(np.maximum(ground_steps, 0.0), 1.0)
+    quality = 1.0 / (1.0 + (error_m / cfg.error_m) ** 2)
     potential = error_m / (error_m + cfg.potential_m)
     previous = previous_error_m / (previous_error_m + cfg.potential_m)
     return np.asarray(
-        cfg.progress * travel * quality
+        cfg.progress * ground * quality
         + cfg.approach * (previous - potential)
         - cfg.heading * np.minimum(1.0, heading_rad / cfg.heading_rad)
         - cfg.smoothness * action_change

@@ -112,7 +112,7 @@ _CATALOGUE: dict[str, Callable[[], Workpiece]] = {
 NAMES = tuple(_CATALOGUE)
 
 
-def get(workpiece: str | Workpiece) -> Workpiece:
+def get(workpiece: object) -> Workpiece:
     """A workpiece by name; a workpiece of the user's passes through.
 
     Args:
@@ -126,7 +126,7 @@ def get(workpiece: str | Workpiece) -> Workpiece:
     """
     if isinstance(workpiece, Workpiece):
         return workpiece
-    if workpiece not in _CATALOGUE:
+    if not isinstance(workpiece, str) or workpiece not in _CATALOGUE:
         raise SeamError(
             f"workpiece = {workpiece!r}: must be one of {list(NAMES)} or a Workpiece "
             "(Workpiece.from_polyline, Workpiece.from_mesh)"

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from seal_gym.core.errors import SeamError, require
+from seal_gym.core.errors import SeamError, is_number, require
 from seal_gym.core.frames import Array, cross, normalise
+from seal_gym.workpieces.seam import MAX_COORDINATE_M
 from seal_gym.workpieces.solids import Solid, hull
 
 # Every triangle becomes a part of some convex piece, and the pieces are looked at in each physics step.
@@ -47,23 +47,29 @@ def read_mesh(path: Path, scale: float) -> Array:
         SeamError,
     )
     require(
-        bool(np.isfinite(scale)) and scale > 0,
+        is_number(scale) and scale > 0,
         f"scale = {scale!r}: must be a number > 0, metres per unit of the file (0.001 for millimetres)",
         SeamError,
     )
-    spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="part", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    mesh.file = str(path.resolve())
-    mesh.scale = [scale] * 3
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part")
+    import trimesh  # only for parts from files
+
     try:
-        model = spec.compile()
-    except ValueError as error:
-        raise SeamError(f"mesh file {path.name!r} cannot be used: {error}") from error
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, model.mesh_quat[0])
-    vertices = model.mesh_vert.astype(np.float64) @ rotation.reshape(3, 3).T + model.mesh_pos[0]
-    triangles = np.asarray(vertices[model.mesh_face])
+        triangles = scale * np.array(trimesh.load_mesh(path, process=False).triangles, dtype=np.float64)
+    except Exception as error:
+        # Its parsers raise whatever a broken file makes them stumble over.
+        raise SeamError(f"mesh file {path.name!r} cannot be used: {error}; export it anew") from error
+    require(
+        triangles.ndim == 3 and len(triangles) > 0 and bool(np.isfinite(triangles).all()),
+        f"mesh file {path.name!r} cannot be used: no triangles, or one that is not finite; export it anew",
+        SeamError,
+    )
+    extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
+    require(
+        bool(extent <= MAX_COORDINATE_M),
+        f"mesh file {path.name!r} is {extent:.3g} m across: at most {MAX_COORDINATE_M:g} m; check the units "
+        f"(scale = {scale:g}, 0.001 for millimetres)",
+        SeamError,
+    )
     require(
         len(triangles) <= MAX_TRIANGLES,
         f"mesh file {path.name!r} has {len(triangles)} triangles: at most {MAX_TRIANGLES}; export it coarser",

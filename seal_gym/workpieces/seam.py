@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from seal_gym.core.errors import SeamError, require
+from seal_gym.core.errors import SeamError, is_number, require
 from seal_gym.core.frames import Array, cross, normalise
 from seal_gym.core.jit import kernel
 
@@ -14,6 +14,12 @@ from seal_gym.core.jit import kernel
 # of a smooth curve and gets the largest arc that fits between its neighbours.
 CORNER_TURN_RAD = np.deg2rad(12.0)
 _SMOOTH_TURN_RAD = 1e-9
+_MIN_SAMPLE_M = 1e-5
+# The tip has to pitch with the floor: a bend up or down as tight as a corner would need 10 deg within 1 mm.
+_MIN_PITCH_RADIUS_M = 20e-3
+_LEVEL_RAD = np.deg2rad(1.0)
+# Coming down from the hover takes up to 20 mm of travel, which must not be most of the seam.
+MIN_LENGTH_M = 0.04
 _ARC_STEP_RAD = np.deg2rad(0.5)
 # The chord of an arc departs from it by R (1 - cos(step / 2)): 0.7 um at 70 mm.
 MIN_SPACING_M = 1e-4
@@ -181,7 +187,10 @@ def _first(bad: NDArray[np.bool_]) -> int | None:
 
 
 def _check_points(points: ArrayLike, approach: ArrayLike) -> tuple[Array, Array]:
-    p, a = np.array(points, dtype=np.float64), np.array(approach, dtype=np.float64)
+    try:
+        p, a = np.array(points, dtype=np.float64), np.array(approach, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SeamError(f"points and approach must be numbers, (n, 3) each: {error}") from error
     require(
         p.ndim == 2 and p.shape[1:] == (3,) and len(p) >= 2,
         f"points has shape {p.shape}: must be (n, 3) with n >= 2, in m, in order of travel",
@@ -266,8 +275,10 @@ def _segments_cross(p: Array, clearance_m: float, closed: bool) -> tuple[int, in
     return None
 
 
-def _round_vertex(before: Array, vertex: Array, after: Array, radius: float | None) -> tuple[Array, float]:
-    """Arc that replaces a vertex: samples (k, 3) and its radius; the largest that fits if None."""
+def _round_vertex(
+    before: Array, vertex: Array, after: Array, radius: float | None
+) -> tuple[Array, Array, float]:
+    """Samples, tangents (k, 3) and radius of the arc for a vertex; the largest that fits if None."""
     u, v = normalise(vertex - before), normalise(after - vertex)
     turn = float(np.arctan2(np.linalg.norm(cross(u, v)), u @ v))
     half = 0.5 * min(float(np.linalg.norm(vertex - before)), float(np.linalg.norm(after - vertex)))
@@ -276,11 +287,13 @@ def _round_vertex(before: Array, vertex: Array, after: Array, radius: float | No
     normal = normalise(v - u * (u @ v))
     steps = max(2, int(np.ceil(turn / _ARC_STEP_RAD)))
     angle = np.linspace(0.0, turn, steps + 1)[:, None]
-    return vertex - cut * u + r * (np.sin(angle) * u + (1.0 - np.cos(angle)) * normal), r
+    points = vertex - cut * u + r * (np.sin(angle) * u + (1.0 - np.cos(angle)) * normal)
+    return points, np.cos(angle) * u + np.sin(angle) * normal, r
 
 
 class _Piece(NamedTuple):
     points: Array
+    tangents: Array
     corner: bool
 
 
@@ -290,10 +303,10 @@ def _round(p: Array, corner_radius: float, n_head: int) -> list[_Piece]:
     length = np.linalg.norm(d, axis=1)
     u = d / length[:, None]
     turn = np.arctan2(np.linalg.norm(cross(u[:-1], u[1:]), axis=1), np.sum(u[:-1] * u[1:], axis=1))
-    pieces = [_Piece(p[:1], False)]
+    pieces = [_Piece(p[:1], u[:1], False)]
     for k, angle in enumerate(turn, start=1):
         if angle < _SMOOTH_TURN_RAD:
-            pieces.append(_Piece(p[k : k + 1], False))
+            pieces.append(_Piece(p[k : k + 1], u[k : k + 1], False))
             continue
         corner = bool(angle > CORNER_TURN_RAD)
         if corner:
@@ -313,15 +326,23 @@ def _round(p: Array, corner_radius: float, n_head: int) -> list[_Piece]:
                 "the radius, or give more points along the curve",
                 SeamError,
             )
-        arc, r = _round_vertex(p[k - 1], p[k], p[k + 1], corner_radius if corner else None)
+        points, tangents, r = _round_vertex(p[k - 1], p[k], p[k + 1], corner_radius if corner else None)
         require(
             r >= MIN_CORNER_RADIUS_M - 1e-12,
             f"the curve at point {k - n_head} has a radius of {r * 1e3:.2f} mm: tighter than the nozzle "
             f"allows; keep it at {MIN_CORNER_RADIUS_M * 1e3:g} mm or more",
             SeamError,
         )
-        pieces.append(_Piece(arc, corner))
-    pieces.append(_Piece(p[-1:], False))
+        pitch = abs(float(np.arcsin(u[k, 2]) - np.arcsin(u[k - 1, 2])))
+        require(
+            pitch < _LEVEL_RAD or r >= _MIN_PITCH_RADIUS_M,
+            f"the seam pitches by {np.rad2deg(pitch):.1f} deg at point {k - n_head} with a radius of "
+            f"{r * 1e3:.1f} mm: the gun needs {_MIN_PITCH_RADIUS_M * 1e3:g} mm or more; enlarge corner_radius "
+            "or give more points along the bend",
+            SeamError,
+        )
+        pieces.append(_Piece(points, tangents, corner))
+    pieces.append(_Piece(p[-1:], u[-1:], False))
     return pieces
 
 
@@ -393,7 +414,7 @@ def build_seam(
     """
     p, a = _check_points(points, approach)
     require(
-        bool(np.isfinite(corner_radius)) and corner_radius > 0,
+        is_number(corner_radius) and corner_radius > 0,
         f"corner_radius = {corner_radius!r}: must be a length in m > 0",
         SeamError,
     )
@@ -426,7 +447,9 @@ def build_seam(
     pieces = _round(extended, corner_radius, n_head)
     position = np.concatenate([piece.points for piece in pieces])
     which = np.repeat(np.arange(len(pieces)), [len(piece.points) for piece in pieces])
-    keep = np.concatenate(([True], np.linalg.norm(np.diff(position, axis=0), axis=1) > 1e-9))
+    # Arcs of neighbouring vertices may all but touch: a curvature is no longer one between such samples.
+    keep = np.concatenate(([True], np.linalg.norm(np.diff(position, axis=0), axis=1) > _MIN_SAMPLE_M))
+    tangent = np.concatenate([piece.tangents for piece in pieces])[keep]
     position, which = position[keep], which[keep]
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))
     # Where each vertex of the polyline ended up: the middle of its piece.
@@ -435,10 +458,15 @@ def build_seam(
     sample_lean = np.interp(arc, middle, extended_lean)
     start, end = middle[n_head], middle[n_head + len(p) - 1]
     _check_lean(arc, sample_lean)
+    require(
+        bool(end - start >= MIN_LENGTH_M - 1e-9),
+        f"the seam is {(end - start) * 1e3:.1f} mm long: at least {MIN_LENGTH_M * 1e3:g} mm, or the gun "
+        "has not come down from its hover before the end",
+        SeamError,
+    )
     corners = np.array(
         [(arc[which == k][0], arc[which == k][-1]) for k, piece in enumerate(pieces) if piece.corner]
     ).reshape(-1, 2)
-    tangent = _tangents(position, pieces, which)
     right = normalise(cross(tangent, _UP))
     up = cross(right, tangent)
     direction = np.cos(sample_lean)[:, None] * up + np.sin(sample_lean)[:, None] * side * right
@@ -456,23 +484,6 @@ def _along(p: Array, distance: float) -> Array:
     """Vertices of a closed polyline after its first, up to the first that lies beyond a distance."""
     arc = np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))
     return p[1 : 2 + min(int(np.searchsorted(arc, distance)), len(arc) - 1)]
-
-
-def _tangents(position: Array, pieces: list[_Piece], which: NDArray[np.intp]) -> Array:
-    """Tangents at the samples: exact on lines, and on arcs the bisector of a circle's two chords."""
-    u = normalise(np.diff(position, axis=0))
-    tangent = np.concatenate((u[:1], normalise(u[:-1] + u[1:]), u[-1:]))
-    for k, piece in enumerate(pieces):
-        index = np.flatnonzero(which == k)
-        if len(piece.points) < 3 or len(index) < 3:
-            continue
-        # At an arc's ends the neighbour is a line: reflect the first chord instead.
-        first, last = index[0], index[-1]
-        inner, outer = tangent[first + 1], u[first]
-        tangent[first] = normalise(2.0 * (inner @ outer) * outer - inner)
-        inner, outer = tangent[last - 1], u[last - 1]
-        tangent[last] = normalise(2.0 * (inner @ outer) * outer - inner)
-    return tangent
 
 
 def _check_lean(arc: Array, lean: Array) -> None:

@@ -23,8 +23,7 @@ _PLATE_MARGIN_M = 0.06
 # Where the middle of a part's seam stands unless a pose is given, in the robot's base frame [m].
 _MIDDLE_M = (0.45, 0.0, -0.05)
 Pose = tuple[float, float, float, float]
-# The cartridge, leaning over a hollow bend, meets the wall's top (found with the reach check: radii down to
-# 12 mm pass under a wall of 25 mm, to 17 mm under one of 30 mm).
+# The cartridge, leaning over a hollow bend, meets the wall's top: what surely does is refused at once.
 _HOLLOW_SHARE = 0.45
 _MAX_GROOVE_LEAN_RAD = np.deg2rad(20.0)
 

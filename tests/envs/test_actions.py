@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from seal_gym.core.cell import load_cell
-from seal_gym.core.errors import ActionError
+from seal_gym.core.errors import ActionError, ConfigError, SealGymError
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_UPPER, tip_kinematics
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
@@ -255,3 +255,61 @@ def test_full_actions_keep_every_number_finite(control):
 def test_limits_come_from_the_cell():
     limits = load_cell().limits
     assert (limits.linear_m_s2, limits.angular_rad_s2, limits.joint_rad_s2) == (1.0, 25.0, 15.0)
+
+
+# -- what users get wrong -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "action", ["fast", ["0"] * 6, {}, None, np.zeros(6, complex), [[0.0], 1, 2], np.zeros((1, 6))]
+)
+def test_an_action_that_is_none_is_refused(make, action):
+    env = make(control="tip")
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=r"takes numbers of shape \(6,\)"):
+        env.unwrapped.step(action)
+
+
+def test_an_outcome_is_paid_once(make):
+    env = make(control="tip")
+    env.reset(seed=0)
+    down, done = np.array([0, 0, -1, 0, 0, 0], np.float32), False
+    while not done:
+        _, reward, terminated, truncated, _ = env.step(down)
+        done = terminated or truncated
+    assert reward < -15
+    assert [env.step(down)[1] for _ in range(3)] == [0.0] * 3
+    env.reset()
+    assert env.step(down)[1] != 0.0
+
+
+def test_a_leaf_that_goes_wrong_is_named(make):
+    def broken(state):
+        n = len(state.q)
+        return Leaf(
+            np.tile(np.eye(6), (n, 1, 1)), np.zeros((n, 6)), np.full((n, 6), np.nan), np.zeros((n, 6, 6))
+        )
+
+    env = make(control="rmp")
+    with pytest.raises(ConfigError, match="leaf = 3: must be a function"):
+        env.unwrapped.add_leaf(3)
+    env.reset(seed=0)
+    q = env.unwrapped.core.arm.q.copy()
+    for leaf, message in (
+        (broken, "'broken' gave a value of accel that is not finite"),
+        (lambda _: 1, "gave 1"),
+    ):
+        env.unwrapped.core.adapter.leaves[:] = [leaf]
+        with pytest.raises(ActionError, match=message):
+            env.step(np.zeros(27, np.float32))
+    np.testing.assert_array_equal(env.unwrapped.core.arm.q, q)
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"reward": None}, {"look": 3}, {"task": {"reach_m": 1}}, {"cell": "x"}, {"leaves": None},
+               {"leaves": (3,)}, {"workpiece": [1]}, {"sealant": True}]
+)  # fmt: skip
+def test_arguments_of_a_wrong_type_are_named(kwargs):
+    (name,) = kwargs
+    with pytest.raises(SealGymError, match=rf"^(leaf|{name}) = "):
+        SealCfg.of(**{"control": "rmp", **kwargs})

@@ -194,12 +194,12 @@ def test_features_are_the_seams_tangent_at_the_point_nearest_the_tip(episode):
 
 
 def test_the_reward_by_hand(flat_episode):
-    """On the flat part everything is closed form: r = travel quality + potential - heading - jumps + 20."""
+    """On the flat part everything is closed form: r = ground x quality + potential - heading - jumps + 20."""
     e = flat_episode
     x, y, z = e.tips[:, :3, 3].T
     s, error = x + 0.15, np.hypot(y + LEAN, z - LEAN)
-    travel = np.clip(np.diff(s) / (0.010 / 30), -1, 1)
-    quality = np.where(travel > 0, 1 / (1 + (error[1:] / 1e-3) ** 2), 1.0)
+    travel = np.clip(np.diff(np.maximum.accumulate(s)) / (0.010 / 30), 0, 1)
+    quality = 1 / (1 + (error[1:] / 1e-3) ** 2)
     potential = error / (error + 5e-3)
     heading = np.minimum(1.0, np.abs(np.deg2rad(e.observations[:-1, [1, 4]])).max(axis=1) / 0.2)
     actions = np.vstack((np.zeros(27), np.array(e.actions, np.float64)))

@@ -57,3 +57,33 @@ def test_trials_resume_and_do_not_depend_on_the_number_of_jobs(tmp_path):
 
     fresh = trials.run_all(wanted, jobs=2, log=tmp_path / "other.jsonl", title="t")
     assert fresh == rows
+
+
+def test_rows_of_other_code_are_run_again(tmp_path):
+    wanted = [trials.Trial(method="rmp_expert", workpiece=write_seam(tmp_path / "s.csv"), seed=1, env=SHORT)]
+    log = tmp_path / "log.jsonl"
+    (row,) = trials.run_all(wanted, jobs=1, log=log, title="t")
+    stale = json.loads(log.read_text())
+    stale["rmse_mm"], stale["code"] = 77.0, "another"
+    log.write_text(json.dumps(stale) + "\n")
+    assert trials.run_all(wanted, jobs=1, log=log, title="t") == [row]
+
+
+@pytest.mark.parametrize("first", ["nan,0,0,0,-0.7071,0.7071", "0.O,0,0,0,-0.7071,0.7071"])
+def test_a_bad_first_row_is_no_header(tmp_path, first):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{first}\n0.1,0,0,0,-0.7071,0.7071\n0.2,0,0,0,-0.7071,0.7071\n")
+    with pytest.raises(SeamError, match=r"line 1|not finite"):
+        trials.workpiece(str(path))
+
+
+def test_a_seam_file_may_come_from_a_spreadsheet_but_not_be_empty(tmp_path):
+    path = tmp_path / "bom.csv"
+    path.write_bytes(b"\xef\xbb\xbf0,0,0,0,0,1\r\n0.1,0,0,0,0,1\r\n")
+    assert len(trials.read_seam(path)[0]) == 2
+    path.write_text("x,y,z,ax,ay,az\n")
+    with pytest.raises(SeamError, match=r"bom\.csv' has 0 points"):
+        trials.read_seam(path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SeamError, match="no text file"):
+        trials.read_seam(path)

@@ -77,6 +77,11 @@ def test_a_viewer_without_a_screen_says_so(monkeypatch):
     def broken(*_, **__):
         raise RuntimeError("could not open a window")
 
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(RenderError, match="DISPLAY"):
+        viewing.SceneView(core()).sync()
+    monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setattr(viewer, "launch_passive", broken)
     with pytest.raises(RenderError, match="rgb_array"):
         viewing.SceneView(core()).sync()
@@ -97,6 +102,7 @@ def test_the_viewer_is_shown_the_current_state(monkeypatch):
         def close(self):
             shown["closed"] = True
 
+    monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setattr(viewer, "launch_passive", Window)
     view = viewing.SceneView(c)
     view.sync()

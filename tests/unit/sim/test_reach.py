@@ -152,3 +152,14 @@ def test_a_part_without_a_pose_is_put_where_it_can_be_sealed():
     shift = np.linalg.inv(found.part_pose) @ env.unwrapped.core.arm.part_pose[0]
     assert np.abs(shift[:2, 3]).max() <= 0.02
     assert np.arctan2(shift[1, 0], shift[0, 0]) == pytest.approx(0.0, abs=np.deg2rad(15.0))
+
+
+def test_an_inner_corner_without_room_for_the_cartridge_is_refused():
+    """On the desired path itself the cartridge is 0.03 mm in the wall, between two of the coarse stations."""
+    corner, lean = [[-0.1, 0, 0], [0, 0, 0], [0, 0.1, 0]], np.array([0, -1, 1]) * np.sqrt(0.5)
+    corner = np.array(corner) * [1, -1, 1]  # to the right, with the wall on the left
+    wide = Workpiece.from_polyline(corner, lean, corner_radius=0.030)
+    place = reach(wide).part_pose
+    pose = (*place[:3, 3], float(np.arctan2(place[1, 0], place[0, 0])))
+    with pytest.raises(SeamError, match="gun/col_cartridge and col_part|col_part_.* and gun/col_cartridge"):
+        reach(Workpiece.from_polyline(corner, lean, corner_radius=0.020, pose=pose))

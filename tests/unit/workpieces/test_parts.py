@@ -439,10 +439,8 @@ def test_bad_mesh_arguments_are_refused(tmp_path: Path) -> None:
     for scale in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(SeamError, match=r"scale = .*must be a number > 0"):
             Workpiece.from_mesh(path, SEAM, TO_RIGHT, scale=scale)
-    with pytest.raises(
-        SeamError, match=r"mm off the mesh 'part.stl': at most 2 mm; check the units \(scale = 1\)"
-    ):
-        Workpiece.from_mesh(path, [[-0.15, 0.5, 0.0], [0.15, 0.5, 0.0]], TO_RIGHT)
+    with pytest.raises(SeamError, match=r"'part.stl' is 400 m across.*check the units \(scale = 1,"):
+        Workpiece.from_mesh(path, SEAM, TO_RIGHT)
     with pytest.raises(SeamError, match=r"the seam is 10.0 mm off the mesh"):
         Workpiece.from_mesh(path, np.add(SEAM, [0, -0.05, 0.01]), TO_RIGHT, scale=1e-3)
     with pytest.raises(SeamError, match=r"pose = .*must be 4 finite"):
@@ -453,3 +451,15 @@ def test_too_many_triangles_are_refused(tmp_path: Path) -> None:
     path = write_stl(tmp_path / "fine.stl", tube(2600))
     with pytest.raises(SeamError, match=r"'fine.stl' has 20800 triangles: at most 20000; export it coarser"):
         read_mesh(path, 1.0)
+
+
+def test_ascii_stl_and_obj_with_normals_and_relative_indices_are_read(tmp_path: Path) -> None:
+    triangle = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.02]])
+    lines = "\n".join(f"vertex {x} {y} {z}" for x, y, z in triangle)
+    stl = tmp_path / "ascii.stl"
+    stl.write_text(f"solid a\nfacet normal 0 0 1\nouter loop\n{lines}\nendloop\nendfacet\nendsolid a\n")
+    obj = tmp_path / "part.obj"
+    points = "\n".join(f"v {x} {y} {z}" for x, y, z in triangle)
+    obj.write_text(f"{points}\nvn 0 0 1\nf -3//1 -2//1 -1//1\n")
+    for path in (stl, obj):
+        np.testing.assert_allclose(read_mesh(path, 1.0), triangle[None], atol=1e-7)

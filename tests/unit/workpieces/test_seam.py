@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import SeamError
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.seam import RUN_ON_M, Seam, build_seam, nearest_on_path
+from seal_gym.workpieces.workpiece import Workpiece
 
 Array = NDArray[np.float64]
 R = np.sqrt(0.5)
@@ -285,3 +286,31 @@ def test_arguments_are_not_changed_nor_kept() -> None:
     seam = build_seam(points, approach)
     points[:] = approach[:] = 7.0
     np.testing.assert_allclose(seam.at(0.0).position, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [50, 200, 400, 1000])
+def test_a_smooth_curve_may_be_sampled_as_finely_as_one_likes(n: int) -> None:
+    t = np.linspace(0.0, 1.0, n)
+    points = np.column_stack((0.25 * t - 0.125, 0.02 * np.sin(2 * np.pi * t), 0 * t))
+    seam = build_seam(points, [0.0, -R, R])
+    bend = np.linalg.norm(np.diff(seam.tangent, axis=0), axis=1) / np.diff(seam.arc)
+    # y'' = 0.02 (2 pi / 0.25)^2 at the crests, where the slope is zero.
+    assert bend.max() == pytest.approx(0.02 * (2 * np.pi / 0.25) ** 2, rel=0.1)
+    Workpiece.from_polyline(points, [0.0, -R, R])
+
+
+def test_a_measured_line_is_not_taken_for_a_bend() -> None:
+    rng = np.random.default_rng(0)
+    points = np.column_stack((np.linspace(0, 0.2, 200), rng.normal(0, 1e-5, 200), np.zeros(200)))
+    Workpiece.from_polyline(points, [0.0, -R, R])
+
+
+def test_a_seam_too_short_for_the_descent_is_refused() -> None:
+    with pytest.raises(SeamError, match=r"is 39\.0 mm long: at least 40 mm"):
+        build_seam([[0, 0, 0], [0.039, 0, 0]], [0, 0, 1])
+
+
+def test_a_floor_that_bends_up_sharply_is_refused() -> None:
+    with pytest.raises(SeamError, match=r"pitches by 16\.7 deg at point 1 with a radius of 5\.0 mm.*20 mm"):
+        build_seam([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0.03]], [0, -R, R])
+    build_seam([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0.03]], [0, -R, R], corner_radius=0.03)
