@@ -337,8 +337,8 @@ def _round(p: Array, corner_radius: float, n_head: int) -> list[_Piece]:
         require(
             pitch < _LEVEL_RAD or r >= _MIN_PITCH_RADIUS_M,
             f"the seam pitches by {np.rad2deg(pitch):.1f} deg at point {k - n_head} with a radius of "
-            f"{r * 1e3:.1f} mm: the gun needs {_MIN_PITCH_RADIUS_M * 1e3:g} mm or more; enlarge corner_radius "
-            "or give more points along the bend",
+            f"{r * 1e3:.1f} mm: the gun needs {_MIN_PITCH_RADIUS_M * 1e3:g} mm or more; enlarge "
+            "corner_radius or give more points along the bend",
             SeamError,
         )
         pieces.append(_Piece(points, tangents, corner))

@@ -161,5 +161,5 @@ def test_an_inner_corner_without_room_for_the_cartridge_is_refused():
     wide = Workpiece.from_polyline(corner, lean, corner_radius=0.030)
     place = reach(wide).part_pose
     pose = (*place[:3, 3], float(np.arctan2(place[1, 0], place[0, 0])))
-    with pytest.raises(SeamError, match="gun/col_cartridge and col_part|col_part_.* and gun/col_cartridge"):
+    with pytest.raises(SeamError, match=r"gun/col_cartridge and col_part|col_part_.* and gun/col_cartridge"):
         reach(Workpiece.from_polyline(corner, lean, corner_radius=0.020, pose=pose))
