@@ -1,9 +1,11 @@
 """MuJoCo's renderer against the raycaster and against the pinhole formula."""
 
+import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
+import seal_gym  # noqa: F401  # registers the ids
 from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import RenderError
 from seal_gym.core.frames import axis_angle, tip_rotation, transform
@@ -129,3 +131,23 @@ def test_without_opengl_the_error_says_what_to_do(monkeypatch):
     monkeypatch.setattr(mujoco, "Renderer", broken)
     with pytest.raises(RenderError, match="libegl1 libgl1 libgl1-mesa-dri"):
         gl.offscreen(None, 8, 8)
+
+
+@pytest.mark.gl
+def test_the_environment_takes_either_renderer():
+    images = {}
+    for renderer in ("raycast", "gl"):
+        env = gym.make(
+            "SealGym/Rectangular-v0",
+            observation="features+images",
+            renderer=renderer,
+            look=LookCfg.clean(),
+            disable_env_checker=True,
+        )
+        observation, info = env.reset(seed=5)
+        assert info["renderer"] == renderer
+        images[renderer] = observation
+    np.testing.assert_array_equal(images["gl"]["features"], images["raycast"]["features"])
+    for view in ("front", "side"):
+        a, b = (images[r][view].astype(float).ravel() for r in images)
+        assert np.corrcoef(a, b)[0, 1] > 0.9
