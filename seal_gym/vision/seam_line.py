@@ -1,0 +1,573 @@
+"""The seam's line in one image: RANSAC on edge pixels, sub-pixel edges row by row, a local curve at the tip.
+
+Both views are worked on as *strips*: rows along the travel, columns across it, with the brighter plate at the
+larger column. The front view upside down is a strip, and so is the transposed side view. A line is written
+``o = p + q (t - t_ref)`` with t along and o across, which does not jump as end points do.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seal_gym.core.errors import require
+from seal_gym.core.frames import Array
+from seal_gym.core.jit import kernel
+from seal_gym.vision.edges import EdgeTables, edge_image
+
+Grey = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_HALF_ROWS = 2  # a row's profile is the mean of five rows along the edge
+_FLANK = 3  # pixels on either side that give the two grey levels
+_GAP = 3  # rows without an edge that a chain passes over
+_MAX_POINTS = 1024
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_2 = np.uint64(0x94D049BB133111EB)
+_S27, _S30, _S31, _S33 = (np.uint64(k) for k in (27, 30, 31, 33))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineCfg:
+    """Parameters of the line stage.
+
+    Attributes:
+        bright_side: +1 if the plate (larger column of the strip) is the brighter side, -1 if it is the darker.
+        hypotheses: Pairs of pixels that RANSAC tries.
+        inlier_px: Largest distance of an inlier [px].
+        max_slope: Of a line against the travel.
+        reach_px: Pixels this far from the tip count half in RANSAC's vote.
+        min_contrast: Smallest step of an edge [grey levels].
+        min_points: Rows with an edge that make a line.
+        search_px: How far from its expected place a row's edge is looked for.
+        window_px: Length of the local curve on either side of the tip.
+        seed: Of RANSAC's draws, the same in each frame.
+    """
+
+    bright_side: int = 1
+    hypotheses: int = 96
+    inlier_px: float = 1.5
+    max_slope: float = 1.2
+    reach_px: float = 40.0
+    min_contrast: float = 8.0
+    min_points: int = 12
+    search_px: float = 3.0
+    window_px: float = 30.0
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        require(self.bright_side in (-1, 1), f"LineCfg.bright_side = {self.bright_side!r}: must be -1 or 1")
+        for name, low, high in (("hypotheses", 1, 10_000), ("min_points", 4, 1000), ("seed", 0, 2**31)):
+            value = getattr(self, name)
+            require(
+                int(value) == value and low <= value <= high,
+                f"LineCfg.{name} = {value!r}: must be a whole number in {low}..{high}",
+            )
+        for name, top in (("inlier_px", 20.0), ("max_slope", 5.0), ("reach_px", 1e3), ("min_contrast", 255.0),
+                          ("search_px", 8.0), ("window_px", 1e3)):  # fmt: skip
+            value = getattr(self, name)
+            require(0.0 < value <= top, f"LineCfg.{name} = {value!r}: must be within (0, {top}]")
+
+    @property
+    def table(self) -> Array:
+        """The numbers as the kernels take them."""
+        return np.array(
+            [
+                self.bright_side,
+                self.hypotheses,
+                self.inlier_px,
+                self.max_slope,
+                self.reach_px,
+                self.min_contrast,
+                self.min_points,
+                self.search_px,
+                self.window_px,
+                self.seed,
+            ],
+            dtype=np.float64,
+        )
+
+
+class StripLine(NamedTuple):
+    """The line of N strips.
+
+    Attributes:
+        line: p, q of the tangent at the seam's point nearest the reference, and its t, shape (N, 3), px.
+        raw: p, q of RANSAC's unrefined line, shape (N, 2), px.
+        confidence: Mean step of the edges found [grey levels]; 0 without a line, shape (N,).
+        valid: Whether there is a line, shape (N,).
+    """
+
+    line: Array
+    raw: Array
+    confidence: Array
+    valid: Mask
+
+
+def strips(front: NDArray[np.uint8], side: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both views as strips.
+
+    Args:
+        front: Shape (N, height, width, 3).
+        side: Likewise.
+
+    Returns:
+        Strips, shape (N, length, width, 3).
+    """
+    return np.ascontiguousarray(front[:, ::-1]), np.ascontiguousarray(side.transpose(0, 2, 1, 3))
+
+
+def dilated(alpha: tuple[Array, Array], margin: int = 2) -> tuple[Mask, Mask]:
+    """The nozzle's mask in either strip, with a margin for the blur and the reach of the masks.
+
+    Args:
+        alpha: The nozzle's coverage of each pixel, front and side, shape (height, width).
+        margin: In pixels.
+
+    Returns:
+        True where the nozzle may be.
+    """
+    out = []
+    for raw in (alpha[0][::-1], alpha[1].T):
+        hit = raw > 0.005
+        wide = np.pad(hit, margin)
+        height, width = hit.shape
+        k = 2 * margin + 1
+        out.append(
+            np.logical_or.reduce([wide[i : i + height, j : j + width] for i in range(k) for j in range(k)])
+        )
+    return out[0], out[1]
+
+
+@kernel
+def _random(word: np.uint64) -> np.uint64:
+    z = word
+    z = (z ^ (z >> _S30)) * _MIX_1
+    z = (z ^ (z >> _S27)) * _MIX_2
+    return z ^ (z >> _S31)
+
+
+@kernel
+def row_edge(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    row: int,
+    o: float,
+    q: float,
+    search: float,
+    par: Array,
+    profile: Array,
+    found: Array,
+) -> bool:
+    """The edge nearest its expected place in a row, to a fraction of a pixel.
+
+    Args:
+        grey: The strip's sum of channels.
+        mask: Where the nozzle is.
+        edge: Where the edge stage found an edge.
+        row: The row; its centre is at t = row + 0.5.
+        o: Where the edge is expected in it.
+        q: The edge's slope: the profile is a mean along it.
+        search: How far from there [px].
+        par: ``LineCfg.table``.
+        profile: Scratch, at least 32 long.
+        found: Filled with the place [px] and the step [grey levels].
+
+    Returns:
+        Whether there is one.
+    """
+    height, width = grey.shape
+    if row < 0 or row >= height:
+        return False
+    half = int(search) + 1
+    middle = int(np.floor(o + 0.5))  # a boundary between the pixels middle - 1 and middle
+    first, count = middle - half - _FLANK, 2 * (half + _FLANK)
+    if first < 0 or first + count > width:
+        # Near the border: as much of the search as there is.
+        first = max(first, 0)
+        count = min(middle + half + _FLANK, width) - first
+        if count < 2 * _FLANK:
+            return False
+    for k in range(count):
+        profile[k] = 0.0
+    rows = 0
+    for y in range(max(row - _HALF_ROWS, 0), min(row + _HALF_ROWS + 1, height)):
+        shift = q * (y - row)
+        whole = int(np.floor(shift))
+        part = shift - whole
+        if first + whole < 0 or first + count + whole + 1 > width:
+            continue
+        rows += 1
+        for k in range(count):
+            x = first + k + whole
+            x1 = min(x + 1, width - 1)
+            profile[k] += (1.0 - part) * grey[y, x] + part * grey[y, x1]
+    if rows < 2:
+        return False
+    sign = par[0] / (3.0 * rows)
+    for k in range(count):
+        profile[k] *= sign
+    best, where = 0.0, -1
+    for b in range(_FLANK, count - _FLANK + 1):
+        if abs(first + b - o) > search + 0.5:
+            continue
+        step = 0.0
+        for k in range(_FLANK):
+            step += profile[b + k] - profile[b - 1 - k]
+        if step > best:
+            best, where = step, b
+    if where < 0:
+        return False
+    # The pixels beside the boundary hold the edge itself: the levels are those beyond them.
+    low = high = 0.0
+    n_low = n_high = 0
+    for k in range(2, _FLANK + 2):
+        if where - 1 - k + 1 >= 0:
+            low += profile[where - k]
+            n_low += 1
+        if where + k - 1 < count:
+            high += profile[where + k - 1]
+            n_high += 1
+    low /= n_low
+    high /= n_high
+    step = high - low
+    if step < par[5]:
+        return False
+    # Each pixel of the transition is the darker side to the share that the edge lies behind it.
+    place = first + where - 2.0
+    for k in range(where - 2, where + 2):
+        if k < 0 or k >= count:
+            place += 0.5
+            continue
+        place += (high - profile[k]) / step
+    if abs(place - o) > search + 1.0:
+        return False
+    column = min(max(int(place), 0), width - 1)
+    for y in range(max(row - 1, 0), min(row + 2, height)):
+        for x in range(max(column - 3, 0), min(column + 4, width)):
+            if mask[y, x]:
+                return False
+    seen = False
+    for x in range(max(column - 1, 0), min(column + 2, width)):
+        seen = seen or edge[row, x]
+    if not seen:
+        return False
+    found[0], found[1] = place, step
+    return True
+
+
+@kernel
+def follow(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    t_ref: float,
+    p: float,
+    q: float,
+    ahead: float,
+    behind: float,
+    par: Array,
+    profile: Array,
+    points: Array,
+) -> int:
+    """Follows the edge from the reference row ahead, then behind.
+
+    Args:
+        grey: The strip's sum of channels.
+        mask: Where the nozzle is.
+        edge: Where the edge stage found an edge.
+        t_ref: The reference's t [px].
+        p: Expected place of the edge at the reference [px].
+        q: Expected slope there.
+        ahead: How far to go ahead [px].
+        behind: How far to go back [px].
+        par: ``LineCfg.table``.
+        profile: Scratch.
+        points: Filled with rows t - t_ref, o, step.
+
+    Returns:
+        Number of points.
+    """
+    found = np.empty(2)
+    count = 0
+    start = int(t_ref)
+    for way in (1, -1):
+        o, slope = p + q * (start + 0.5 - t_ref), q
+        row, missed = start, 0
+        if way < 0:
+            row -= 1
+            o -= q
+        reach = ahead if way > 0 else behind
+        hits = 0
+        while abs(row + 0.5 - t_ref) <= reach and missed <= _GAP + 20 * (hits == 0) and abs(slope) < 2.0:
+            search = par[7] if hits == 0 else min(par[7], 1.5)
+            if count < len(points) and row_edge(grey, mask, edge, row, o, slope, search, par, profile, found):
+                error = found[0] - o
+                o += 0.5 * error
+                slope += way * 0.06 * error
+                points[count, 0], points[count, 1], points[count, 2] = row + 0.5 - t_ref, found[0], found[1]
+                count += 1
+                hits += 1
+                missed = 0
+            else:
+                missed += 1
+            o += way * slope
+            row += way
+    return count
+
+
+@kernel
+def fit_curve(
+    y: Array, x: Array, w: Array, n: int, prior: float, clip: float, out: Array
+) -> float:
+    """Weighted least squares of x = out[0] + out[1] y + out[2] y^2, outliers weighed down.
+
+    Args:
+        y: Abscissae.
+        x: Ordinates.
+        w: Weights, inverse variances.
+        n: How many.
+        prior: Inverse variance of out[2] about 0.
+        clip: Residuals beyond this weigh less.
+        out: The coefficients.
+
+    Returns:
+        The sum of the weights in the end, or 0 if there is no curve.
+    """
+    total = 0.0
+    for turn in range(3):
+        s0 = s1 = s2 = s3 = s4 = b0 = b1 = b2 = 0.0
+        for k in range(n):
+            weight = w[k]
+            if turn > 0:
+                r = abs(x[k] - (out[0] + out[1] * y[k] + out[2] * y[k] * y[k]))
+                if r > clip:
+                    weight *= (clip / r) ** 2
+            u = weight * y[k]
+            uu = u * y[k]
+            s0 += weight
+            s1 += u
+            s2 += uu
+            s3 += uu * y[k]
+            s4 += uu * y[k] * y[k]
+            b0 += weight * x[k]
+            b1 += u * x[k]
+            b2 += uu * x[k]
+        s4 += prior
+        total = s0
+        # Cholesky's factors of the three normal equations.
+        if s0 <= 0.0:
+            return 0.0
+        l0 = np.sqrt(s0)
+        l1, l2 = s1 / l0, s2 / l0
+        d1 = s2 - l1 * l1
+        if d1 <= 1e-12 * s2:
+            return 0.0
+        m1 = np.sqrt(d1)
+        m2 = (s3 - l1 * l2) / m1
+        d2 = s4 - l2 * l2 - m2 * m2
+        if d2 <= 1e-14 * s4:
+            return 0.0
+        k2 = np.sqrt(d2)
+        z0 = b0 / l0
+        z1 = (b1 - l1 * z0) / m1
+        z2 = (b2 - l2 * z0 - m2 * z1) / k2
+        out[2] = z2 / k2
+        out[1] = (z1 - m2 * out[2]) / m1
+        out[0] = (z0 - l1 * out[1] - l2 * out[2]) / l0
+    return total
+
+
+@kernel
+def _ransac(
+    t: Array, o: Array, vote: Array, n: int, par: Array, seed: np.uint64, line: Array
+) -> float:
+    """The line with the most votes, then fitted to its inliers; returns their votes."""
+    best = 0.0
+    word = seed
+    inlier, max_slope = par[2], par[3]
+    for _ in range(int(par[1])):
+        word += _GOLDEN
+        r = _random(word)
+        i, j = int((r >> _S33) % np.uint64(n)), int((r & np.uint64(0x7FFFFFFF)) % np.uint64(n))
+        dt = t[j] - t[i]
+        if abs(dt) < 5.0:
+            continue
+        q = (o[j] - o[i]) / dt
+        if abs(q) > max_slope:
+            continue
+        p = o[i] - q * t[i]
+        reach = inlier * np.sqrt(1.0 + q * q)
+        votes = 0.0
+        for k in range(n):
+            if abs(o[k] - p - q * t[k]) <= reach:
+                votes += vote[k]
+        if votes > best:
+            best, line[0], line[1] = votes, p, q
+    if best <= 0.0:
+        return 0.0
+    s0 = s1 = s2 = b0 = b1 = 0.0
+    for k in range(n):
+        if abs(o[k] - line[0] - line[1] * t[k]) <= inlier * np.sqrt(1.0 + line[1] * line[1]):
+            s0 += vote[k]
+            s1 += vote[k] * t[k]
+            s2 += vote[k] * t[k] * t[k]
+            b0 += vote[k] * o[k]
+            b1 += vote[k] * o[k] * t[k]
+    det = s0 * s2 - s1 * s1
+    if det > 1e-9 * s0 * s2:
+        line[0], line[1] = (b0 * s2 - b1 * s1) / det, (b1 * s0 - b0 * s1) / det
+    return best
+
+
+@kernel
+def ransac_line(
+    edge: Mask, mask: Mask, intensity: Array, ex: Array, ey: Array, t_ref: float, par: Array, line: Array
+) -> bool:
+    """The line through the edge pixels of the expected polarity that are not the nozzle's.
+
+    Args:
+        edge: Where the edge stage found an edge.
+        mask: Where the nozzle is.
+        intensity: Edge intensity.
+        ex: Edge vector across the strip.
+        ey: Edge vector along the strip.
+        t_ref: The reference's t [px].
+        par: ``LineCfg.table``.
+        line: p and q, filled.
+
+    Returns:
+        Whether there is one.
+    """
+    t, o, vote = np.empty(_MAX_POINTS), np.empty(_MAX_POINTS), np.empty(_MAX_POINTS)
+    n = 0
+    height, width = edge.shape
+    # The rows and columns at the border have masks that reach out of the picture.
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if not edge[i, j] or mask[i, j] or n >= _MAX_POINTS:
+                continue
+            across = along = 0.0
+            for y in range(i - 1, i + 2):
+                for x in range(j - 1, j + 2):
+                    across += ex[y, x]
+                    along += ey[y, x]
+            if par[0] * across <= 0.5 * abs(along):
+                continue
+            t[n], o[n] = i + 0.5 - t_ref, j + 0.5
+            vote[n] = intensity[i, j] / (1.0 + (t[n] / par[4]) ** 2)
+            n += 1
+    if n < par[6]:
+        return False
+    return _ransac(t, o, vote, n, par, np.uint64(int(par[9])), line) > 0.0
+
+
+@kernel
+def local_line(
+    points: Array, n: int, t_ref: float, o_ref: float, p: float, par: Array, work: Array, line: Array
+) -> float:
+    """Tangent of the local curve at its point nearest the reference; returns the mean step, 0 without."""
+    if n < par[6]:
+        return 0.0
+    step = 0.0
+    window = par[8]
+    # Abscissae in windows keep the equations well conditioned.
+    for k in range(n):
+        u = points[k, 0] / window
+        work[0, k], work[1, k] = u, points[k, 1] - p
+        work[2, k] = 1.0 / (1.0 + 2.0 * u * u)
+        step += points[k, 2]
+    curve = np.zeros(3)
+    if fit_curve(work[0], work[1], work[2], n, 0.01, 1.0, curve) <= 0.0:
+        return 0.0
+    c0, c1, c2 = p + curve[0] - o_ref, curve[1] / window, curve[2] / (window * window)
+    s = 0.0
+    for _ in range(5):
+        x, slope = c0 + (c1 + c2 * s) * s, c1 + 2.0 * c2 * s
+        s -= (s + x * slope) / max(0.5, 1.0 + slope * slope + 2.0 * c2 * x)
+        s = min(max(s, -0.5 * window), 0.5 * window)
+    q = c1 + 2.0 * c2 * s
+    line[0], line[1], line[2] = o_ref + c0 + (c1 + c2 * s) * s - q * s, q, s
+    return step / n
+
+
+@kernel
+def _find_batch(
+    images: NDArray[np.uint8],
+    mask: Mask,
+    reference: Array,
+    tap: Array,
+    pad: int,
+    edge_par: Array,
+    g_log_g: Array,
+    par: Array,
+    line: Array,
+    raw: Array,
+    confidence: Array,
+    valid: Mask,
+) -> None:
+    n, height, width = images.shape[:3]
+    grey = np.empty((height, width), np.int64)
+    padded, work = np.empty((height + 2 * pad, width + 2 * pad)), np.empty((height, width))
+    ex, ey, bins = np.empty((height, width)), np.empty((height, width)), np.empty(512, np.int64)
+    magnitude, orientation = np.empty((height, width)), np.empty((height, width))
+    intensity, edge = np.empty((height, width)), np.empty((height, width), np.bool_)
+    profile, points, columns = np.empty(64), np.empty((2 * height, 3)), np.empty((3, 2 * height))
+    for k in range(n):
+        for i in range(height):
+            for j in range(width):
+                grey[i, j] = (
+                    np.int64(images[k, i, j, 0]) + np.int64(images[k, i, j, 1]) + np.int64(images[k, i, j, 2])
+                )
+        edge_image(
+            grey,
+            tap,
+            pad,
+            edge_par,
+            g_log_g,
+            padded,
+            work,
+            bins,
+            ex,
+            ey,
+            magnitude,
+            orientation,
+            intensity,
+            edge,
+        )
+        valid[k], confidence[k] = False, 0.0
+        if not ransac_line(edge, mask, intensity, ex, ey, reference[0], par, raw[k]):
+            continue
+        p, q = raw[k, 0], raw[k, 1]
+        count = follow(grey, mask, edge, reference[0], p, q, par[8], par[8], par, profile, points)
+        confidence[k] = local_line(points, count, reference[0], reference[1], p, par, columns, line[k])
+        valid[k] = confidence[k] > 0.0
+
+
+def find_lines(
+    images: NDArray[np.uint8],
+    mask: Mask,
+    reference: Array,
+    edges: EdgeTables,
+    cfg: LineCfg | None = None,
+) -> StripLine:
+    """Finds the seam's line in strips, each by itself.
+
+    Args:
+        images: Strips, shape (N, length, width, 3).
+        mask: Where the nozzle is, shape (length, width).
+        reference: t and o of the point one stand-off before the nozzle mouth, shape (2,), px.
+        edges: The edge stage.
+        cfg: Parameters.
+
+    Returns:
+        The lines; without one, ``valid`` is false.
+    """
+    n = len(images)
+    out = StripLine(np.zeros((n, 3)), np.zeros((n, 2)), np.zeros(n), np.zeros(n, np.bool_))
+    _find_batch(images, mask, reference, *edges, (cfg or LineCfg()).table, *out)
+    return out
