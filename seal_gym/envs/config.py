@@ -14,7 +14,7 @@ from seal_gym.tasks.reward import RewardCfg
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.workpiece import Workpiece
 
-PERCEPTIONS = ("oracle",)
+PERCEPTIONS = ("oracle", "vision")
 OBSERVATIONS = ("features", "features+images")
 RENDERERS = ("raycast", "gl")
 
@@ -50,7 +50,8 @@ class SealCfg:
         workpiece: A name (``flat``, ``cylinder``, ``rectangular``) or a ``Workpiece``.
         control: ``"tip"`` (6 tip accelerations), ``"rmp"`` (6 f and 21 Cholesky entries of A) or ``"joint"``
             (6 joint accelerations); all in [-1, 1].
-        perception: ``"oracle"``: the ROI features from the true geometry through the calibrated cameras.
+        perception: ``"oracle"``: the ROI features from the true geometry through the calibrated cameras;
+            ``"vision"``: from the sensor images.
         observation: ``"features"`` or ``"features+images"``.
         renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
         sealant: ``False``: this version simulates the gun's motion, not the sealant.

@@ -16,11 +16,13 @@ from seal_gym.estimation.seam_rate import SeamRate
 from seal_gym.planning import ik
 from seal_gym.rmp import SeamErrors
 from seal_gym.sim.arm import ArmBatch
+from seal_gym.sim.raycast import Images
 from seal_gym.sim.reach import check_reach
 from seal_gym.sim.scene import Scene, cached_scene
 from seal_gym.tasks.progress import Progress
 from seal_gym.tasks.reward import reward
 from seal_gym.vision.features import RoiFeatures, SeamLines, ViewGeometry, oracle_lines, update_features
+from seal_gym.vision.perception import Perception
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.seam import seam_in_world
 
@@ -111,6 +113,10 @@ class SealCore:
         self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
         self.sensors = Sensors(self.scene, cfg, n)
         self._views = ViewGeometry.of(cell)
+        self._vision: Perception | None = None
+        if cfg.perception == "vision":
+            self._vision = Perception(n, self._views, self.sensors.nozzle, cell.timing.frame_s)
+        self._images: Images | None = None
         self._rate = SeamRate(n, cell.timing.frame_s)
         self.features = RoiFeatures.zeros(n)
         self.lines = SeamLines(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2), np.bool_))
@@ -167,6 +173,8 @@ class SealCore:
         self.sensors.reset(i, rng)
         self.progress.reset(i, hovering[:3, 3])
         self._rate.reset(i)
+        if self._vision is not None:
+            self._vision.reset(i)
         self.features.clear(i)
         self._tip_accel[i] = 0.0
         self._action[i] = 0.0
@@ -224,7 +232,7 @@ class SealCore:
         features = self._feature_rows()
         if self.cfg.observation == "features":
             return features
-        images = self.sensors.images(self.tip.pose, self.arm, self.frames)
+        images = self._images or self.sensors.images(self.tip.pose, self.arm, self.frames)
         return {"features": features, "front": images.front, "side": images.side}
 
     # -- the parts of a step ----------------------------------------------------------------------------
@@ -280,13 +288,16 @@ class SealCore:
         )
         return StepResult(value, reached, touched, lost, timeout)
 
-    def _seam_lines(self) -> SeamLines:
+    def _seam_lines(self, rows: NDArray[np.bool_] | None) -> SeamLines:
         """The one place where perception differs: the oracle projects the true seam into the views."""
+        if self._vision is not None:
+            self._images = self.sensors.images(self.tip.pose, self.arm, self.frames)
+            return self._vision.update(self._images.front, self._images.side, self.tip.pose, rows)
         point, tangent = seam_in_world(self._seam, self.progress.s, self.arm.part_pose)
         return oracle_lines(point, tangent, self.tip.pose, self._views)
 
     def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
-        self.lines = self._seam_lines()
+        self.lines = self._seam_lines(rows)
         update_features(self.features, self.lines, self._views)
         self._rate.update(
             self.features.point_m,
@@ -327,7 +338,8 @@ class SealCore:
     @property
     def snr_db(self) -> Array | None:
         """Signal-to-noise ratio of the observed images, shape (N, 2), dB; None without images."""
-        return None if self.cfg.observation == "features" else self.sensors.snr_db
+        blind = self.cfg.observation == "features" and self.cfg.perception == "oracle"
+        return None if blind else self.sensors.snr_db
 
     def add_leaf(self, leaf: LeafFunction) -> None:
         """Adds an RMP leaf at run time.

@@ -67,6 +67,14 @@ class Sensors:
         return out
 
     @cached_property
+    def nozzle(self) -> tuple[Array, Array]:
+        """The nozzle's coverage of each pixel, 0..1, front and side, shape (height, width)."""
+        drawn = self._renderer
+        if not isinstance(drawn, Raycaster):
+            drawn = Raycaster(self._scene.workpiece.surface, self._scene.cell, self._scene.tool)
+        return drawn.nozzle_alpha
+
+    @cached_property
     def _renderer(self) -> _Renderer:
         if self._cfg.renderer == "gl":
             from seal_gym.sim.gl import GlSensors  # needs OpenGL: only when asked for

@@ -1,0 +1,675 @@
+"""The seam's tangent at the tip from the two ROI images, frame after frame.
+
+RANSAC in both views starts a track: their lines' planes meet in the seam's tangent, kept in the world, where
+a seam at rest does not jump. Each frame then
+
+1. follows the front view's edge ahead from where the tangent is expected, and remembers its pixels as rays in
+   the world: the nozzle hides the seam behind the tip, but the memory holds it, which corners need;
+2. meets the rays with the plate's plane through the tangent and fits a quadratic to what lies within a few
+   millimetres of the tip; its tangent at the point nearest the tip is the new one;
+3. looks for that curve in the side view, whose offset and slope correct the plane's height and pitch by a
+   Kalman filter each, with gating.
+
+The front view fixes the seam in the plane, the side view fixes the plane. A view without the seam coasts on
+the tangent in the world for a while, then is invalid, and RANSAC looks for a new start.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seal_gym.core.errors import require
+from seal_gym.core.frames import Array
+from seal_gym.core.jit import kernel
+from seal_gym.vision.edges import EdgeCfg, EdgeTables, edge_image
+from seal_gym.vision.features import MIN_SEEN_PX, SeamLines, ViewGeometry, _length_inside
+from seal_gym.vision.seam_line import LineCfg, dilated, fit_curve, follow, local_line, ransac_line, row_edge
+
+Bytes = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
+
+_MM, _DEG = 1e-3, float(np.deg2rad(1.0))
+_ROOT_HALF = float(np.sqrt(0.5))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerceptionCfg:
+    """Parameters of the tracker.
+
+    Attributes:
+        edges: The edge stage.
+        line: The line stage.
+        coast_s: A lost view is believed for this long [s].
+        memory_s: Age at which a remembered edge is dropped [s].
+        ahead_px: How far ahead the front view's edge is remembered [px].
+        sigma_m: Width of the fit around the tip [m].
+        bend: Standard deviation of the curve's quadratic coefficient [1/m].
+        clip_m: Residuals beyond this weigh less [m].
+        jump_m: A new edge this far from the memory's curve makes it forget [m].
+        row_sigma_m: Standard deviation of a row's edge at a step of one grey level [m].
+        side_px: How far ahead and behind the side view is looked at [px].
+        height_q_m: Drift of the plane's height from frame to frame [m].
+        pitch_q_rad: Drift of its pitch [rad].
+        gate: Measurements this many standard deviations off are not believed.
+    """
+
+    edges: EdgeCfg = field(default_factory=EdgeCfg)
+    line: LineCfg = field(default_factory=LineCfg)
+    coast_s: float = 0.3
+    memory_s: float = 1.0
+    ahead_px: float = 26.0
+    sigma_m: float = 2.0 * _MM
+    bend: float = 80.0
+    clip_m: float = 0.15 * _MM
+    jump_m: float = 0.4 * _MM
+    row_sigma_m: float = 3.0 * _MM
+    side_px: float = 18.0
+    height_q_m: float = 0.01 * _MM
+    pitch_q_rad: float = 0.1 * _DEG
+    gate: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        for name in ("coast_s", "memory_s", "ahead_px", "sigma_m", "bend", "clip_m", "jump_m", "row_sigma_m",
+                     "side_px", "height_q_m", "pitch_q_rad", "gate"):  # fmt: skip
+            value = getattr(self, name)
+            require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
+
+
+class _State(NamedTuple):
+    """What is remembered of N simulations."""
+
+    point: Array  # the tangent's point nearest the tip, world, (N, 3), m
+    direction: Array  # its direction of travel, world, (N, 3)
+    variance: Array  # of the plane's height and pitch, (N, 2)
+    tracking: Bools  # (N,)
+    missed: NDArray[np.int64]  # frames without the seam, (N, 2)
+    clock: NDArray[np.int64]  # frames since the reset, (N,)
+    eye: Array  # remembered rays: optical centre, world, (N, K, 3), m
+    ray: Array  # direction, (N, K, 3)
+    weight: Array  # (N, K)
+    stamp: NDArray[np.int64]  # frame of each, -1 for none, (N, K)
+    head: NDArray[np.int64]  # where the next ray goes, (N,)
+
+
+class _Scratch(NamedTuple):
+    """Work space of one frame."""
+
+    grey: NDArray[np.int64]
+    padded: Array
+    work: Array
+    bins: NDArray[np.int64]
+    ex: Array
+    ey: Array
+    magnitude: Array
+    orientation: Array
+    intensity: Array
+    edge: Bools
+    profile: Array
+    points: Array
+    columns: Array
+    fit: Array
+
+
+@kernel
+def _grey_strip(image: Bytes, view: int, grey: NDArray[np.int64]) -> None:
+    """Sum of the channels, as a strip: the front view upside down, the side view transposed."""
+    height, width = image.shape[0], image.shape[1]
+    for i in range(height):
+        for j in range(width):
+            total = np.int64(image[i, j, 0]) + np.int64(image[i, j, 1]) + np.int64(image[i, j, 2])
+            if view == 0:
+                grey[height - 1 - i, j] = total
+            else:
+                grey[j, i] = total
+
+
+@kernel
+def _to_strip(p: Array, view: int, g: ViewGeometry, out: Array) -> bool:
+    """Image of a point of the tip frame as t, o of the strip; False if it is behind the camera."""
+    x = y = z = 0.0
+    for k in range(3):
+        d = p[k] - g.position[view, k]
+        x += g.rotation[view, k, 0] * d
+        y += g.rotation[view, k, 1] * d
+        z += g.rotation[view, k, 2] * d
+    if z < 1e-3:
+        return False
+    u, v = g.centre[view, 0] + g.focal[view] * x / z, g.centre[view, 1] + g.focal[view] * y / z
+    if view == 0:
+        out[0], out[1] = g.size[0, 1] - v, u
+    else:
+        out[0], out[1] = u, v
+    return True
+
+
+@kernel
+def _strip_ray(t: float, o: float, view: int, g: ViewGeometry, out: Array) -> None:
+    """Ray of a strip's point in the tip frame."""
+    u, v = (o, g.size[0, 1] - t) if view == 0 else (t, o)
+    x, y = (u - g.centre[view, 0]) / g.focal[view], (v - g.centre[view, 1]) / g.focal[view]
+    for k in range(3):
+        out[k] = g.rotation[view, k, 0] * x + g.rotation[view, k, 1] * y + g.rotation[view, k, 2]
+
+
+@kernel
+def _strip_slope(p: Array, d: Array, view: int, g: ViewGeometry, line: Array) -> bool:
+    """t and o of a point and do/dt of a direction there (line: t, o, q)."""
+    a, b = np.empty(2), np.empty(2)
+    ahead = np.empty(3)
+    for k in range(3):
+        ahead[k] = p[k] + 1e-6 * d[k]
+    if not (_to_strip(p, view, g, a) and _to_strip(ahead, view, g, b)):
+        return False
+    if b[0] - a[0] < 1e-5:  # less than 0.01 px a mm of travel
+        return False
+    line[0], line[1], line[2] = a[0], a[1], (b[1] - a[1]) / (b[0] - a[0])
+    return True
+
+
+@kernel
+def _emit(
+    i: int, v: int, p: Array, d: Array, g: ViewGeometry, point: Array, direction: Array, valid: Bools
+) -> None:
+    """Projects the tangent (tip frame) into a view."""
+    pc, dc = np.zeros(3), np.zeros(3)
+    for r in range(3):
+        for k in range(3):
+            pc[r] += g.rotation[v, k, r] * (p[k] - g.position[v, k])
+            dc[r] += g.rotation[v, k, r] * d[k]
+    if pc[2] < 1e-3:
+        valid[i, v] = False
+        return
+    x, y = pc[0] / pc[2], pc[1] / pc[2]
+    point[i, v, 0], point[i, v, 1] = g.centre[v, 0] + g.focal[v] * x, g.centre[v, 1] + g.focal[v] * y
+    direction[i, v, 0], direction[i, v, 1] = dc[0] - x * dc[2], dc[1] - y * dc[2]
+    valid[i, v] = _length_inside(point[i, v], direction[i, v], g.size[v]) >= MIN_SEEN_PX
+
+
+@kernel
+def _edges_of(image: Bytes, view: int, e: EdgeTables, s: _Scratch) -> None:
+    _grey_strip(image, view, s.grey)
+    edge_image(
+        s.grey,
+        e.tap,
+        e.pad,
+        e.par,
+        e.g_log_g,
+        s.padded,
+        s.work,
+        s.bins,
+        s.ex,
+        s.ey,
+        s.magnitude,
+        s.orientation,
+        s.intensity,
+        s.edge,
+    )
+
+
+@kernel
+def _search(
+    view: int, mask: Bools, ref: Array, par: Array, s: _Scratch, line: Array
+) -> bool:
+    """A line without knowing where to look."""
+    raw = np.empty(2)
+    if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], par, raw):
+        return False
+    n = follow(
+        s.grey, mask, s.edge, ref[0], raw[0], raw[1], par[8], par[8], par, s.profile, s.points
+    )
+    return bool(local_line(s.points, n, ref[0], ref[1], raw[0], par, s.columns, line) > 0.0)
+
+
+@kernel
+def _normalise(v: Array) -> None:
+    size = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    for k in range(3):
+        v[k] /= size
+
+
+@kernel
+def _plate(d: Array, n: Array, m: Array) -> None:
+    """Normal n of the plate's plane through a tangent d, and its m across, both in the tip frame.
+
+    The nozzle halves the right angle of wall (on the left) and plate.
+    """
+    n[0], n[1], n[2] = -_ROOT_HALF, 0.0, _ROOT_HALF
+    along = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    for k in range(3):
+        n[k] -= along * d[k]
+    _normalise(n)
+    m[0] = d[1] * n[2] - d[2] * n[1]
+    m[1] = d[2] * n[0] - d[0] * n[2]
+    m[2] = d[0] * n[1] - d[1] * n[0]
+
+
+@kernel
+def _triangulate(lines: Array, ref: Array, g: ViewGeometry, p: Array, d: Array) -> bool:
+    """The tangent (tip frame) whose images the two views' lines are."""
+    normal, offset = np.empty((2, 3)), np.zeros(2)
+    a, b = np.empty(3), np.empty(3)
+    for v in range(2):
+        # Two rays span the plane.
+        _strip_ray(ref[v, 0], lines[v, 0], v, g, a)
+        _strip_ray(ref[v, 0] + 10.0, lines[v, 0] + 10.0 * lines[v, 1], v, g, b)
+        normal[v, 0] = a[1] * b[2] - a[2] * b[1]
+        normal[v, 1] = a[2] * b[0] - a[0] * b[2]
+        normal[v, 2] = a[0] * b[1] - a[1] * b[0]
+        for k in range(3):
+            offset[v] += normal[v, k] * g.position[v, k]
+    d[0] = normal[0, 1] * normal[1, 2] - normal[0, 2] * normal[1, 1]
+    d[1] = normal[0, 2] * normal[1, 0] - normal[0, 0] * normal[1, 2]
+    d[2] = normal[0, 0] * normal[1, 1] - normal[0, 1] * normal[1, 0]
+    size = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    if abs(d[1]) < 0.3 * size:
+        return False
+    p[0] = (normal[0, 2] * offset[1] - normal[1, 2] * offset[0]) / d[1]
+    p[1] = 0.0
+    p[2] = (normal[1, 0] * offset[0] - normal[0, 0] * offset[1]) / d[1]
+    way = 1.0 if d[1] > 0.0 else -1.0
+    for k in range(3):
+        d[k] *= way / size
+    return bool(abs(p[0]) < 0.03 and abs(p[2]) < 0.04)
+
+
+@kernel
+def _fit_memory(
+    i: int, tip: Array, p: Array, d: Array, n: Array, m: Array, oldest: int, par: Array, state: _State,
+    fit: Array, curve: Array,
+) -> float:
+    """Fits the remembered rays near the tip in the plate's plane; returns the curve's residual now [m]."""
+    sigma, bend, clip = par[2], par[3], par[4]
+    count = fresh = 0
+    now = state.clock[i]
+    c, r = np.empty(3), np.empty(3)
+    for k in range(state.stamp.shape[1]):
+        if state.stamp[i, k] < oldest:
+            continue
+        for a in range(3):
+            c[a] = r[a] = 0.0
+            for b in range(3):
+                c[a] += tip[b, a] * (state.eye[i, k, b] - tip[b, 3])
+                r[a] += tip[b, a] * state.ray[i, k, b]
+        down = n[0] * r[0] + n[1] * r[1] + n[2] * r[2]
+        if down > -1e-3:
+            continue
+        gap = n[0] * (p[0] - c[0]) + n[1] * (p[1] - c[1]) + n[2] * (p[2] - c[2])
+        along = across = 0.0
+        for a in range(3):
+            x = c[a] + r[a] * gap / down - p[a]
+            along += x * d[a]
+            across += x * m[a]
+        if abs(along) > 2.5 * sigma:
+            continue
+        fit[0, count], fit[1, count] = along / sigma, across
+        fit[2, count] = state.weight[i, k] * np.exp(-0.5 * (along / sigma) ** 2)
+        fit[3, count] = 1.0 if state.stamp[i, k] == now else 0.0
+        fresh += int(fit[3, count])
+        count += 1
+    prior = 1.0 / (bend * sigma * sigma) ** 2
+    if count < 8 or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
+        return -1.0
+    off = weight = 0.0
+    for k in range(count):
+        w = fit[2, k] * fit[3, k]
+        y = fit[0, k]
+        off += w * (fit[1, k] - curve[0] - (curve[1] + curve[2] * y) * y)
+        weight += w
+    curve[1] /= sigma
+    curve[2] /= sigma * sigma
+    return abs(off) / weight if weight > 0.0 else 0.0
+
+
+@kernel
+def _remember(
+    i: int, tip: Array, count: int, ref: Array, g: ViewGeometry, par: Array, state: _State, s: _Scratch
+) -> None:
+    """Keeps every second of the points followed in the front view as rays in the world."""
+    ray = np.empty(3)
+    for k in range(0, count, 2):
+        _strip_ray(ref[0] + s.points[k, 0], s.points[k, 1], 0, g, ray)
+        h = state.head[i]
+        for a in range(3):
+            state.eye[i, h, a] = tip[a, 3]
+            state.ray[i, h, a] = 0.0
+            for b in range(3):
+                state.eye[i, h, a] += tip[a, b] * g.position[0, b]
+                state.ray[i, h, a] += tip[a, b] * ray[b]
+        state.weight[i, h] = (s.points[k, 2] / par[6]) ** 2
+        state.stamp[i, h] = state.clock[i]
+        state.head[i] = (h + 1) % state.stamp.shape[1]
+
+
+@kernel
+def _track_front(
+    i: int, tip: Array, mask: Bools, ref: Array, g: ViewGeometry, lp: Array, par: Array, state: _State,
+    s: _Scratch, p: Array, d: Array, curve: Array,
+) -> bool:
+    """Steps 1 and 2: moves the tangent (tip frame) to where the front view has it."""
+    line, n, m = np.empty(3), np.empty(3), np.empty(3)
+    if not _strip_slope(p, d, 0, g, line):
+        return False
+    q = line[2]
+    if abs(q) > 2.0:
+        return False
+    count = follow(
+        s.grey, mask, s.edge, ref[0], line[1] + q * (ref[0] - line[0]), q, par[1], par[1], lp, s.profile, s.points
+    )
+    if count < 8:
+        return False
+    _remember(i, tip, count, ref, g, par, state, s)
+    _plate(d, n, m)
+    oldest = max(state.clock[i] - int(par[0]), 0)
+    off = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
+    if off > par[5]:
+        for k in range(state.stamp.shape[1]):
+            if state.stamp[i, k] != state.clock[i]:
+                state.stamp[i, k] = -1
+        off = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
+    if off < 0.0:
+        return False
+    # The curve's point nearest the tip, the origin: |p + y d + x(y) m| is least.
+    pd = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+    pm = p[0] * m[0] + p[1] * m[1] + p[2] * m[2]
+    y = 0.0
+    for _ in range(6):
+        x, slope = curve[0] + (curve[1] + curve[2] * y) * y, curve[1] + 2.0 * curve[2] * y
+        y -= (pd + y + (pm + x) * slope) / max(0.3, 1.0 + slope * slope + 2.0 * curve[2] * (pm + x))
+        y = min(max(y, -0.004), 0.004)
+    x, slope = curve[0] + (curve[1] + curve[2] * y) * y, curve[1] + 2.0 * curve[2] * y
+    for k in range(3):
+        p[k] += y * d[k] + x * m[k]
+        d[k] += slope * m[k]
+    _normalise(d)
+    return True
+
+
+@kernel
+def _track_side(
+    i: int, mask: Bools, g: ViewGeometry, lp: Array, par: Array, state: _State, s: _Scratch, p: Array,
+    d: Array, bend: float,
+) -> bool:
+    """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
+    line, n, m, found = np.empty(3), np.empty(3), np.empty(3), np.empty(2)
+    a, b, x = np.empty(2), np.empty(2), np.empty(3)
+    if not _strip_slope(p, d, 1, g, line):
+        return False
+    _plate(d, n, m)
+    for k in range(3):
+        x[k] = p[k] + 1e-3 * d[k]
+    if not (_to_strip(x, 1, g, b) and _to_strip(p, 1, g, a)):
+        return False
+    scale = (b[0] - a[0]) * 1e3  # px a metre of travel
+    # Height moves the seam along the front view's ray, which keeps its image there.
+    for k in range(3):
+        x[k] = p[k] - g.position[0, k]
+    down = n[0] * x[0] + n[1] * x[1] + n[2] * x[2]
+    if down > -1e-3:
+        return False
+    lift = np.empty(3)
+    for k in range(3):
+        lift[k] = x[k] / down
+        x[k] = p[k] + 1e-4 * lift[k]
+    if not _to_strip(x, 1, g, b):
+        return False
+    rise = ((b[1] - a[1]) - line[2] * (b[0] - a[0])) * 1e4  # px a metre of height
+    if abs(rise) < 1e3:
+        return False
+    count = 0
+    s0 = s1 = s2 = b0 = b1 = 0.0
+    for row in range(int(line[0] - par[7]), int(line[0] + par[7]) + 1):
+        t = row + 0.5 - line[0]
+        y = t / scale
+        for _ in range(2):
+            for k in range(3):
+                x[k] = p[k] + y * d[k] + bend * y * y * m[k]
+            if not _to_strip(x, 1, g, b):
+                return False
+            y += (row + 0.5 - b[0]) / scale
+        slope = line[2] if y == 0.0 else (b[1] - a[1]) / (b[0] - a[0] + 1e-9)
+        slope = min(max(2.0 * slope - line[2], -2.0), 2.0)
+        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp[7], lp, s.profile, found):
+            continue
+        error = found[0] - b[1]
+        # Far rows hang on the curve's bend, which is less sure.
+        w = found[1] * found[1] / (1.0 + (2.0 * t / par[7]) ** 4)
+        s0 += w
+        s1 += w * t
+        s2 += w * t * t
+        b0 += w * error
+        b1 += w * error * t
+        count += 1
+    if count < 8:
+        return False
+    det = s0 * s2 - s1 * s1
+    if det <= 1e-6 * s0 * s2:
+        return False
+    e0, e1 = (b0 * s2 - b1 * s1) / det, (b1 * s0 - b0 * s1) / det
+    # Neighbouring rows share pixels: five times the variance of independent ones.
+    noise = 5.0 * (par[6] * rise) ** 2
+    height, pitch = e0 / rise, e1 / rise * scale
+    r_height = noise * s2 / det / rise**2 + (2e-5) ** 2
+    r_pitch = noise * s0 / det / rise**2 * scale**2 + (2e-3) ** 2
+    v_height, v_pitch = state.variance[i, 0] + par[8] ** 2, state.variance[i, 1] + par[9] ** 2
+    state.variance[i, 0], state.variance[i, 1] = v_height, v_pitch
+    if height * height > par[10] ** 2 * (v_height + r_height):
+        return False
+    gain = v_height / (v_height + r_height)
+    state.variance[i, 0] = (1.0 - gain) ** 2 * v_height + gain * gain * r_height
+    for k in range(3):
+        p[k] += gain * height * lift[k]
+    if pitch * pitch <= par[10] ** 2 * (v_pitch + r_pitch):
+        gain = v_pitch / (v_pitch + r_pitch)
+        state.variance[i, 1] = (1.0 - gain) ** 2 * v_pitch + gain * gain * r_pitch
+        for k in range(3):
+            d[k] += gain * pitch * lift[k]
+        _normalise(d)
+    return True
+
+
+@kernel
+def _forget(i: int, state: _State) -> None:
+    state.tracking[i] = False
+    state.missed[i, 0] = state.missed[i, 1] = 0
+    for k in range(state.stamp.shape[1]):
+        state.stamp[i, k] = -1
+
+
+@kernel
+def _perceive(
+    front: Bytes,
+    side: Bytes,
+    mask_front: Bools,
+    mask_side: Bools,
+    tips: Array,
+    rows: Bools,
+    ref: Array,
+    g: ViewGeometry,
+    e: EdgeTables,
+    lp: Array,
+    par: Array,
+    state: _State,
+    s: _Scratch,
+    point: Array,
+    direction: Array,
+    valid: Bools,
+) -> None:
+    p, d, curve, line = np.empty(3), np.empty(3), np.zeros(3), np.empty(3)
+    lines, seen = np.zeros((2, 3)), np.zeros(2, np.bool_)
+    for i in range(len(front)):
+        if not rows[i]:
+            continue
+        tip = tips[i]
+        state.clock[i] += 1
+        if state.tracking[i]:
+            for a in range(3):
+                p[a] = d[a] = 0.0
+                for b in range(3):
+                    p[a] += tip[b, a] * (state.point[i, b] - tip[b, 3])
+                    d[a] += tip[b, a] * state.direction[i, b]
+            # The tangent's point nearest the tip.
+            along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+            for k in range(3):
+                p[k] -= along * d[k]
+            curve[2] = 0.0
+            _edges_of(front[i], 0, e, s)
+            seen[0] = _track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve)
+            _edges_of(side[i], 1, e, s)
+            seen[1] = _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2])
+            for v in range(2):
+                state.missed[i, v] = 0 if seen[v] else state.missed[i, v] + 1
+            if max(state.missed[i, 0], state.missed[i, 1]) > par[11]:
+                _forget(i, state)
+        if not state.tracking[i]:
+            _edges_of(front[i], 0, e, s)
+            seen[0] = _search(0, mask_front, ref[0], lp, s, line)
+            lines[0] = line
+            _edges_of(side[i], 1, e, s)
+            seen[1] = _search(1, mask_side, ref[1], lp, s, line)
+            lines[1] = line
+            if not (seen[0] and seen[1] and _triangulate(lines, ref, g, p, d)):
+                for v in range(2):
+                    valid[i, v] = False
+                continue
+            _forget(i, state)
+            state.tracking[i] = True
+            state.variance[i, 0], state.variance[i, 1] = (2e-4) ** 2, (0.03) ** 2
+            along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+            for k in range(3):
+                p[k] -= along * d[k]
+        for a in range(3):
+            state.point[i, a], state.direction[i, a] = tip[a, 3], 0.0
+            for b in range(3):
+                state.point[i, a] += tip[a, b] * p[b]
+                state.direction[i, a] += tip[a, b] * d[b]
+        for v in range(2):
+            _emit(i, v, p, d, g, point, direction, valid)
+
+
+class Perception:
+    """Estimates the seam's line in both views of N simulations; rows never mix.
+
+    Args:
+        n: Number of simulations.
+        views: The calibrated cameras.
+        nozzle: The nozzle's coverage of each pixel, front and side, shape (height, width).
+        frame_s: Duration of a frame [s].
+        cfg: Parameters.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        views: ViewGeometry,
+        nozzle: tuple[Array, Array],
+        frame_s: float,
+        cfg: PerceptionCfg | None = None,
+    ) -> None:
+        cfg = cfg or PerceptionCfg()
+        length, width = int(views.size[0, 1]), int(views.size[0, 0])
+        require(
+            (length, width) == (int(views.size[1, 0]), int(views.size[1, 1])),
+            f"ROIs of {views.size.tolist()} px: the side view's has to be the front view's on its side",
+        )
+        self._views = ViewGeometry(*(np.ascontiguousarray(x, np.float64) for x in views))
+        self._masks = dilated(nozzle)
+        ref = views.reference
+        self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
+        self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.table
+        memory = max(int(round(cfg.memory_s / frame_s)), 1)
+        self._par = np.array(
+            [
+                memory,
+                cfg.ahead_px,
+                cfg.sigma_m,
+                cfg.bend,
+                cfg.clip_m,
+                cfg.jump_m,
+                cfg.row_sigma_m,
+                cfg.side_px,
+                cfg.height_q_m,
+                cfg.pitch_q_rad,
+                cfg.gate,
+                cfg.coast_s / frame_s + 1e-9,
+            ],
+            dtype=np.float64,
+        )
+        rays = (memory + 1) * (int(cfg.ahead_px) + 1)
+        self._state = _State(
+            point=np.zeros((n, 3)),
+            direction=np.zeros((n, 3)),
+            variance=np.zeros((n, 2)),
+            tracking=np.zeros(n, np.bool_),
+            missed=np.zeros((n, 2), np.int64),
+            clock=np.zeros(n, np.int64),
+            eye=np.zeros((n, rays, 3)),
+            ray=np.zeros((n, rays, 3)),
+            weight=np.zeros((n, rays)),
+            stamp=np.full((n, rays), -1, np.int64),
+            head=np.zeros(n, np.int64),
+        )
+        shape, pad = (length, width), self._edges.pad
+        self._scratch = _Scratch(
+            grey=np.empty(shape, np.int64),
+            padded=np.empty((length + 2 * pad, width + 2 * pad)),
+            work=np.empty(shape),
+            bins=np.empty(512, np.int64),
+            ex=np.empty(shape),
+            ey=np.empty(shape),
+            magnitude=np.empty(shape),
+            orientation=np.empty(shape),
+            intensity=np.empty(shape),
+            edge=np.empty(shape, np.bool_),
+            profile=np.empty(64),
+            points=np.empty((2 * length, 3)),
+            columns=np.empty((3, 2 * length)),
+            fit=np.empty((4, rays)),
+        )
+        self._lines = SeamLines(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2), np.bool_))
+
+    def reset(self, i: int) -> None:
+        """Forgets what one simulation has seen.
+
+        Args:
+            i: Which simulation.
+        """
+        for values in self._state:
+            values[i] = 0
+        self._state.stamp[i] = -1
+        for values in self._lines:
+            values[i] = 0
+
+    def update(
+        self, front: Bytes, side: Bytes, tip_pose: Array, rows: NDArray[np.bool_] | None = None
+    ) -> SeamLines:
+        """Takes the images of a new frame.
+
+        Args:
+            front: Shape (N, height, width, 3).
+            side: Shape (N, height, width, 3).
+            tip_pose: ``T_world_tip`` when they were taken, shape (N, 4, 4), m.
+            rows: Simulations that have a new frame, shape (N,), all by default; the others keep their lines.
+
+        Returns:
+            The seam's lines; arrays of the caller's own. A view that has not shown the seam for the
+            coasting time is invalid.
+        """
+        _perceive(
+            np.ascontiguousarray(front),
+            np.ascontiguousarray(side),
+            *self._masks,
+            np.ascontiguousarray(tip_pose, dtype=np.float64),
+            np.ones(len(front), np.bool_) if rows is None else np.ascontiguousarray(rows, np.bool_),
+            self._reference,
+            self._views,
+            self._edges,
+            self._line,
+            self._par,
+            self._state,
+            self._scratch,
+            *self._lines,
+        )
+        return SeamLines(*(x.copy() for x in self._lines))
