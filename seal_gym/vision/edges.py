@@ -387,7 +387,11 @@ class EdgeStage:
         colour = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
         shape = colour.shape[:3]
         out = EdgeMap(
-            np.empty((*shape, 2)), np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.bool_)
+            np.empty((*shape, 2)),
+            np.empty(shape),
+            np.empty(shape),
+            np.empty(shape),
+            np.empty(shape, np.bool_),
         )
         _edge_batch(np.ascontiguousarray(colour), *self._tables, *out)
         return out

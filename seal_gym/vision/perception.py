@@ -210,16 +210,12 @@ def _edges_of(image: Bytes, view: int, e: EdgeTables, s: _Scratch) -> None:
 
 
 @kernel
-def _search(
-    view: int, mask: Bools, ref: Array, par: Array, s: _Scratch, line: Array
-) -> bool:
+def _search(view: int, mask: Bools, ref: Array, par: Array, s: _Scratch, line: Array) -> bool:
     """A line without knowing where to look."""
     raw = np.empty(2)
     if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], par, raw):
         return False
-    n = follow(
-        s.grey, mask, s.edge, ref[0], raw[0], raw[1], par[8], par[8], par, s.profile, s.points
-    )
+    n = follow(s.grey, mask, s.edge, ref[0], raw[0], raw[1], par[8], par[8], par, s.profile, s.points)
     return bool(local_line(s.points, n, ref[0], ref[1], raw[0], par, s.columns, line) > 0.0)
 
 
@@ -277,8 +273,17 @@ def _triangulate(lines: Array, ref: Array, g: ViewGeometry, p: Array, d: Array) 
 
 @kernel
 def _fit_memory(
-    i: int, tip: Array, p: Array, d: Array, n: Array, m: Array, oldest: int, par: Array, state: _State,
-    fit: Array, curve: Array,
+    i: int,
+    tip: Array,
+    p: Array,
+    d: Array,
+    n: Array,
+    m: Array,
+    oldest: int,
+    par: Array,
+    state: _State,
+    fit: Array,
+    curve: Array,
 ) -> float:
     """Fits the remembered rays near the tip in the plate's plane; returns the curve's residual now [m]."""
     sigma, bend, clip = par[2], par[3], par[4]
@@ -345,8 +350,18 @@ def _remember(
 
 @kernel
 def _track_front(
-    i: int, tip: Array, mask: Bools, ref: Array, g: ViewGeometry, lp: Array, par: Array, state: _State,
-    s: _Scratch, p: Array, d: Array, curve: Array,
+    i: int,
+    tip: Array,
+    mask: Bools,
+    ref: Array,
+    g: ViewGeometry,
+    lp: Array,
+    par: Array,
+    state: _State,
+    s: _Scratch,
+    p: Array,
+    d: Array,
+    curve: Array,
 ) -> bool:
     """Steps 1 and 2: moves the tangent (tip frame) to where the front view has it."""
     line, n, m = np.empty(3), np.empty(3), np.empty(3)
@@ -356,7 +371,17 @@ def _track_front(
     if abs(q) > 2.0:
         return False
     count = follow(
-        s.grey, mask, s.edge, ref[0], line[1] + q * (ref[0] - line[0]), q, par[1], par[1], lp, s.profile, s.points
+        s.grey,
+        mask,
+        s.edge,
+        ref[0],
+        line[1] + q * (ref[0] - line[0]),
+        q,
+        par[1],
+        par[1],
+        lp,
+        s.profile,
+        s.points,
     )
     if count < 8:
         return False
@@ -389,8 +414,16 @@ def _track_front(
 
 @kernel
 def _track_side(
-    i: int, mask: Bools, g: ViewGeometry, lp: Array, par: Array, state: _State, s: _Scratch, p: Array,
-    d: Array, bend: float,
+    i: int,
+    mask: Bools,
+    g: ViewGeometry,
+    lp: Array,
+    par: Array,
+    state: _State,
+    s: _Scratch,
+    p: Array,
+    d: Array,
+    bend: float,
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, found = np.empty(3), np.empty(3), np.empty(3), np.empty(2)

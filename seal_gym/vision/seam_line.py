@@ -321,9 +321,7 @@ def follow(
 
 
 @kernel
-def fit_curve(
-    y: Array, x: Array, w: Array, n: int, prior: float, clip: float, out: Array
-) -> float:
+def fit_curve(y: Array, x: Array, w: Array, n: int, prior: float, clip: float, out: Array) -> float:
     """Weighted least squares of x = out[0] + out[1] y + out[2] y^2, outliers weighed down.
 
     Args:
@@ -383,9 +381,7 @@ def fit_curve(
 
 
 @kernel
-def _ransac(
-    t: Array, o: Array, vote: Array, n: int, par: Array, seed: np.uint64, line: Array
-) -> float:
+def _ransac(t: Array, o: Array, vote: Array, n: int, par: Array, seed: np.uint64, line: Array) -> float:
     """The line with the most votes, then fitted to its inliers; returns their votes."""
     best = 0.0
     word = seed

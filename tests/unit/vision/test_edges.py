@@ -102,7 +102,9 @@ def test_order_one_is_the_ordinary_difference():
     kx, ky = correlation_masks(cfg)
     expected = np.zeros((5, 5))
     expected[1:4, 1:4] = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 8
-    expected[1:4, 1:4] = np.where(expected[1:4, 1:4] == 0, 0, np.array([[-1, 0, 1]] * 3) * [[1], [2], [1]] / 8)
+    expected[1:4, 1:4] = np.where(
+        expected[1:4, 1:4] == 0, 0, np.array([[-1, 0, 1]] * 3) * [[1], [2], [1]] / 8
+    )
     np.testing.assert_allclose(kx, expected, atol=1e-15)
     np.testing.assert_allclose(ky, expected.T, atol=1e-15)
 
@@ -177,7 +179,9 @@ def test_bad_parameters_are_refused(kwargs):
         EdgeCfg(**kwargs)
 
 
-@pytest.mark.parametrize("image", [np.zeros((2, 9, 9)), np.zeros((9, 9), np.uint8), np.zeros((1, 9, 9, 4), np.uint8)])
+@pytest.mark.parametrize(
+    "image", [np.zeros((2, 9, 9)), np.zeros((9, 9), np.uint8), np.zeros((1, 9, 9, 4), np.uint8)]
+)
 def test_bad_images_are_refused(image):
     with pytest.raises(ConfigError, match="uint8"):
         EdgeStage()(image)
