@@ -126,8 +126,16 @@ def grey_sum(image: Bytes, out: NDArray[np.int64]) -> None:
 
 
 @kernel
-def _vectors(grey: NDArray[np.int64], tap: Array, pad: int, padded: Array, ex: Array, ey: Array) -> float:
-    """Edge vectors in grey levels; returns the largest squared length."""
+def _vectors(
+    grey: NDArray[np.int64],
+    mask: NDArray[np.bool_],
+    tap: Array,
+    pad: int,
+    padded: Array,
+    ex: Array,
+    ey: Array,
+) -> float:
+    """Edge vectors in grey levels, none under the mask; returns the largest squared length."""
     height, width = grey.shape
     third = 1.0 / 3.0
     for i in range(height + 2 * pad):
@@ -147,6 +155,8 @@ def _vectors(grey: NDArray[np.int64], tap: Array, pad: int, padded: Array, ex: A
     top = 0.0
     for i in range(height):
         for j in range(width):
+            if mask[i, j]:
+                ex[i, j] = ey[i, j] = 0.0
             top = max(top, ex[i, j] * ex[i, j] + ey[i, j] * ey[i, j])
     return top
 
@@ -199,7 +209,7 @@ def _orientation(ex: Array, ey: Array, i: int, j: int) -> float:
         for x in range(max(j - 1, 0), min(j + 2, ex.shape[1])):
             c += ex[y, x] * ex[y, x] - ey[y, x] * ey[y, x]
             s += 2.0 * ex[y, x] * ey[y, x]
-    return 0.5 * np.arctan2(s, c)
+    return float(0.5 * np.arctan2(s, c))
 
 
 @kernel
@@ -238,6 +248,7 @@ def _contrast(grey: NDArray[np.int64], i: int, j: int, g_log_g: Array) -> float:
 @kernel
 def edge_image(
     grey: NDArray[np.int64],
+    mask: NDArray[np.bool_],
     tap: Array,
     pad: int,
     par: Array,
@@ -252,13 +263,16 @@ def edge_image(
     intensity: Array,
     edge: NDArray[np.bool_],
 ) -> None:
-    """The whole stage for one image, from the sum of its channels; see ``EdgeStage``."""
+    """The whole stage for one image, from the sum of its channels; nothing under the mask is an edge.
+
+    The mask keeps the nozzle, of any contrast, from setting the scale that the seam is measured by.
+    """
     height, width = grey.shape
     a, b, c, tau, share = par[0], par[1], par[2], par[3], par[4]
     orientation[:] = 0.0
     intensity[:] = 0.0
     edge[:] = False
-    top = _vectors(grey, tap, pad, padded, ex, ey)
+    top = _vectors(grey, mask, tap, pad, padded, ex, ey)
     if top < 1e-18:
         ex[:] = 0.0
         ey[:] = 0.0
@@ -302,13 +316,14 @@ def _edge_batch(
     edge: NDArray[np.bool_],
 ) -> None:
     n, height, width = images.shape[:3]
-    grey = np.empty((height, width), np.int64)
+    grey, mask = np.empty((height, width), np.int64), np.zeros((height, width), np.bool_)
     padded, work = np.empty((height + 2 * pad, width + 2 * pad)), np.empty((height, width))
     ex, ey, bins = np.empty((height, width)), np.empty((height, width)), np.empty(_BINS, np.int64)
     for k in range(n):
         grey_sum(images[k], grey)
         edge_image(
             grey,
+            mask,
             tap,
             pad,
             par,

@@ -32,6 +32,9 @@ Bools = NDArray[np.bool_]
 
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _ROOT_HALF = float(np.sqrt(0.5))
+_MIN_ROWS = 8  # with an edge, for a view to count as seen
+_HEIGHT_START, _PITCH_START = 0.2 * _MM, 0.03
+_HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +159,7 @@ def _strip_ray(t: float, o: float, view: int, g: ViewGeometry, out: Array) -> No
 
 @kernel
 def _strip_slope(p: Array, d: Array, view: int, g: ViewGeometry, line: Array) -> bool:
-    """t and o of a point and do/dt of a direction there (line: t, o, q)."""
+    """The t and o of a point and do/dt of a direction there (line: t, o, q)."""
     a, b = np.empty(2), np.empty(2)
     ahead = np.empty(3)
     for k in range(3):
@@ -189,10 +192,11 @@ def _emit(
 
 
 @kernel
-def _edges_of(image: Bytes, view: int, e: EdgeTables, s: _Scratch) -> None:
+def _edges_of(image: Bytes, view: int, mask: Bools, e: EdgeTables, s: _Scratch) -> None:
     _grey_strip(image, view, s.grey)
     edge_image(
         s.grey,
+        mask,
         e.tap,
         e.pad,
         e.par,
@@ -315,7 +319,7 @@ def _fit_memory(
         fresh += int(fit[3, count])
         count += 1
     prior = 1.0 / (bend * sigma * sigma) ** 2
-    if count < 8 or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
+    if count < _MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return -1.0
     off = weight = 0.0
     for k in range(count):
@@ -383,7 +387,7 @@ def _track_front(
         s.profile,
         s.points,
     )
-    if count < 8:
+    if count < _MIN_ROWS:
         return False
     _remember(i, tip, count, ref, g, par, state, s)
     _plate(d, n, m)
@@ -413,6 +417,97 @@ def _track_front(
 
 
 @kernel
+def _side_frame(
+    p: Array, d: Array, n: Array, g: ViewGeometry, lift: Array, line: Array, per_m: Array
+) -> bool:
+    """How the side view answers to height: a lift's direction, the line, px a metre of travel and of height.
+
+    Height moves the seam along the front view's ray, which keeps its image there.
+    """
+    a, b, x = np.empty(2), np.empty(2), np.empty(3)
+    down = 0.0
+    for k in range(3):
+        down += n[k] * (p[k] - g.position[0, k])
+    if down > -1e-3 or not (_strip_slope(p, d, 1, g, line) and _to_strip(p, 1, g, a)):
+        return False
+    for k in range(3):
+        lift[k] = (p[k] - g.position[0, k]) / down
+        x[k] = p[k] + 1e-3 * d[k]
+    if not _to_strip(x, 1, g, b):
+        return False
+    per_m[0] = (b[0] - a[0]) * 1e3
+    for k in range(3):
+        x[k] = p[k] + 1e-4 * lift[k]
+    if not _to_strip(x, 1, g, b):
+        return False
+    per_m[1] = ((b[1] - a[1]) - line[2] * (b[0] - a[0])) * 1e4
+    return bool(abs(per_m[1]) > 1e3)
+
+
+@kernel
+def _side_residual(
+    mask: Bools,
+    g: ViewGeometry,
+    lp: Array,
+    par: Array,
+    s: _Scratch,
+    p: Array,
+    d: Array,
+    m: Array,
+    bend: float,
+    line: Array,
+    scale: float,
+    out: Array,
+) -> bool:
+    """Offset, slope and their variances at a step of 1 (out) of the side view's edge against the curve."""
+    b, x, found = np.empty(2), np.empty(3), np.empty(2)
+    count = 0
+    s0 = s1 = s2 = b0 = b1 = 0.0
+    for row in range(int(line[0] - par[7]), int(line[0] + par[7]) + 1):
+        t = row + 0.5 - line[0]
+        y = t / scale
+        for _ in range(2):
+            for k in range(3):
+                x[k] = p[k] + y * d[k] + bend * y * y * m[k]
+            if not _to_strip(x, 1, g, b):
+                return False
+            y += (row + 0.5 - b[0]) / scale
+        slope = line[2]
+        if abs(t) > 1e-9:
+            # Chord of a parabola: its end's slope is twice the chord's less the start's.
+            slope = min(max(2.0 * (b[1] - line[1]) / t - line[2], -2.0), 2.0)
+        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp[7], lp, s.profile, found):
+            continue
+        error = found[0] - b[1]
+        # Far rows hang on the curve's bend, which is less sure.
+        w = found[1] * found[1] / (1.0 + (2.0 * t / par[7]) ** 4)
+        s0 += w
+        s1 += w * t
+        s2 += w * t * t
+        b0 += w * error
+        b1 += w * error * t
+        count += 1
+    det = s0 * s2 - s1 * s1
+    if count < _MIN_ROWS or det <= 1e-6 * s0 * s2:
+        return False
+    out[0], out[1] = (b0 * s2 - b1 * s1) / det, (b1 * s0 - b0 * s1) / det
+    out[2], out[3] = s2 / det, s0 / det
+    return True
+
+
+@kernel
+def _kalman(variance: Array, k: int, drift: float, error: float, noise: float, gate: float) -> float:
+    """One scalar Kalman step (Joseph's form): the correction, 0 if the measurement is not believed."""
+    ahead = variance[k] + drift * drift
+    variance[k] = ahead
+    if error * error > gate * gate * (ahead + noise):
+        return 0.0
+    gain = ahead / (ahead + noise)
+    variance[k] = (1.0 - gain) ** 2 * ahead + gain * gain * noise
+    return float(gain * error)
+
+
+@kernel
 def _track_side(
     i: int,
     mask: Bools,
@@ -426,80 +521,26 @@ def _track_side(
     bend: float,
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
-    line, n, m, found = np.empty(3), np.empty(3), np.empty(3), np.empty(2)
-    a, b, x = np.empty(2), np.empty(2), np.empty(3)
-    if not _strip_slope(p, d, 1, g, line):
-        return False
+    line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    per_m, out = np.empty(2), np.empty(4)
     _plate(d, n, m)
-    for k in range(3):
-        x[k] = p[k] + 1e-3 * d[k]
-    if not (_to_strip(x, 1, g, b) and _to_strip(p, 1, g, a)):
+    if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
-    scale = (b[0] - a[0]) * 1e3  # px a metre of travel
-    # Height moves the seam along the front view's ray, which keeps its image there.
-    for k in range(3):
-        x[k] = p[k] - g.position[0, k]
-    down = n[0] * x[0] + n[1] * x[1] + n[2] * x[2]
-    if down > -1e-3:
+    if not _side_residual(mask, g, lp, par, s, p, d, m, bend, line, per_m[0], out):
         return False
-    lift = np.empty(3)
-    for k in range(3):
-        lift[k] = x[k] / down
-        x[k] = p[k] + 1e-4 * lift[k]
-    if not _to_strip(x, 1, g, b):
-        return False
-    rise = ((b[1] - a[1]) - line[2] * (b[0] - a[0])) * 1e4  # px a metre of height
-    if abs(rise) < 1e3:
-        return False
-    count = 0
-    s0 = s1 = s2 = b0 = b1 = 0.0
-    for row in range(int(line[0] - par[7]), int(line[0] + par[7]) + 1):
-        t = row + 0.5 - line[0]
-        y = t / scale
-        for _ in range(2):
-            for k in range(3):
-                x[k] = p[k] + y * d[k] + bend * y * y * m[k]
-            if not _to_strip(x, 1, g, b):
-                return False
-            y += (row + 0.5 - b[0]) / scale
-        slope = line[2] if y == 0.0 else (b[1] - a[1]) / (b[0] - a[0] + 1e-9)
-        slope = min(max(2.0 * slope - line[2], -2.0), 2.0)
-        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp[7], lp, s.profile, found):
-            continue
-        error = found[0] - b[1]
-        # Far rows hang on the curve's bend, which is less sure.
-        w = found[1] * found[1] / (1.0 + (2.0 * t / par[7]) ** 4)
-        s0 += w
-        s1 += w * t
-        s2 += w * t * t
-        b0 += w * error
-        b1 += w * error * t
-        count += 1
-    if count < 8:
-        return False
-    det = s0 * s2 - s1 * s1
-    if det <= 1e-6 * s0 * s2:
-        return False
-    e0, e1 = (b0 * s2 - b1 * s1) / det, (b1 * s0 - b0 * s1) / det
     # Neighbouring rows share pixels: five times the variance of independent ones.
-    noise = 5.0 * (par[6] * rise) ** 2
-    height, pitch = e0 / rise, e1 / rise * scale
-    r_height = noise * s2 / det / rise**2 + (2e-5) ** 2
-    r_pitch = noise * s0 / det / rise**2 * scale**2 + (2e-3) ** 2
-    v_height, v_pitch = state.variance[i, 0] + par[8] ** 2, state.variance[i, 1] + par[9] ** 2
-    state.variance[i, 0], state.variance[i, 1] = v_height, v_pitch
-    if height * height > par[10] ** 2 * (v_height + r_height):
+    noise = 5.0 * par[6] ** 2
+    r_height = noise * out[2] + _HEIGHT_FLOOR**2
+    r_pitch = noise * out[3] * per_m[0] ** 2 + _PITCH_FLOOR**2
+    variance = state.variance[i]
+    height = _kalman(variance, 0, par[8], out[0] / per_m[1], r_height, par[10])
+    if height == 0.0:
         return False
-    gain = v_height / (v_height + r_height)
-    state.variance[i, 0] = (1.0 - gain) ** 2 * v_height + gain * gain * r_height
+    pitch = _kalman(variance, 1, par[9], out[1] / per_m[1] * per_m[0], r_pitch, par[10])
     for k in range(3):
-        p[k] += gain * height * lift[k]
-    if pitch * pitch <= par[10] ** 2 * (v_pitch + r_pitch):
-        gain = v_pitch / (v_pitch + r_pitch)
-        state.variance[i, 1] = (1.0 - gain) ** 2 * v_pitch + gain * gain * r_pitch
-        for k in range(3):
-            d[k] += gain * pitch * lift[k]
-        _normalise(d)
+        p[k] += height * lift[k]
+        d[k] += pitch * lift[k]
+    _normalise(d)
     return True
 
 
@@ -509,6 +550,89 @@ def _forget(i: int, state: _State) -> None:
     state.missed[i, 0] = state.missed[i, 1] = 0
     for k in range(state.stamp.shape[1]):
         state.stamp[i, k] = -1
+
+
+@kernel
+def _nearest(p: Array, d: Array) -> None:
+    """Moves a tangent's point to the one nearest the tip, the origin."""
+    along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+    for k in range(3):
+        p[k] -= along * d[k]
+
+
+@kernel
+def _track(
+    i: int,
+    front: Bytes,
+    side: Bytes,
+    mask_front: Bools,
+    mask_side: Bools,
+    tip: Array,
+    ref: Array,
+    g: ViewGeometry,
+    e: EdgeTables,
+    lp: Array,
+    par: Array,
+    state: _State,
+    s: _Scratch,
+    p: Array,
+    d: Array,
+) -> bool:
+    """Carries a track on by a frame; False when it is given up."""
+    for a in range(3):
+        p[a] = d[a] = 0.0
+        for b in range(3):
+            p[a] += tip[b, a] * (state.point[i, b] - tip[b, 3])
+            d[a] += tip[b, a] * state.direction[i, b]
+    _nearest(p, d)
+    curve = np.zeros(3)
+    _edges_of(front, 0, mask_front, e, s)
+    if _track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve):
+        state.missed[i, 0] = 0
+    else:
+        state.missed[i, 0] += 1
+        curve[2] = 0.0
+    _edges_of(side, 1, mask_side, e, s)
+    if _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2]):
+        state.missed[i, 1] = 0
+    else:
+        state.missed[i, 1] += 1
+    return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par[11])
+
+
+@kernel
+def _start(
+    i: int,
+    front: Bytes,
+    side: Bytes,
+    mask_front: Bools,
+    mask_side: Bools,
+    ref: Array,
+    g: ViewGeometry,
+    e: EdgeTables,
+    lp: Array,
+    state: _State,
+    s: _Scratch,
+    p: Array,
+    d: Array,
+) -> bool:
+    """Looks for a seam that is not tracked; False if the views show none."""
+    _forget(i, state)
+    line, lines = np.empty(3), np.empty((2, 3))
+    _edges_of(front, 0, mask_front, e, s)
+    if not _search(0, mask_front, ref[0], lp, s, line):
+        return False
+    lines[0] = line
+    _edges_of(side, 1, mask_side, e, s)
+    if not _search(1, mask_side, ref[1], lp, s, line):
+        return False
+    lines[1] = line
+    if not _triangulate(lines, ref, g, p, d):
+        return False
+    _nearest(p, d)
+    state.tracking[i] = True
+    state.variance[i, 0], state.variance[i, 1] = _HEIGHT_START**2, _PITCH_START**2
+    return True
 
 
 @kernel
@@ -530,49 +654,22 @@ def _perceive(
     direction: Array,
     valid: Bools,
 ) -> None:
-    p, d, curve, line = np.empty(3), np.empty(3), np.zeros(3), np.empty(3)
-    lines, seen = np.zeros((2, 3)), np.zeros(2, np.bool_)
+    p, d = np.empty(3), np.empty(3)
     for i in range(len(front)):
         if not rows[i]:
             continue
         tip = tips[i]
         state.clock[i] += 1
+        known = False
         if state.tracking[i]:
-            for a in range(3):
-                p[a] = d[a] = 0.0
-                for b in range(3):
-                    p[a] += tip[b, a] * (state.point[i, b] - tip[b, 3])
-                    d[a] += tip[b, a] * state.direction[i, b]
-            # The tangent's point nearest the tip.
-            along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
-            for k in range(3):
-                p[k] -= along * d[k]
-            curve[2] = 0.0
-            _edges_of(front[i], 0, e, s)
-            seen[0] = _track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve)
-            _edges_of(side[i], 1, e, s)
-            seen[1] = _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2])
-            for v in range(2):
-                state.missed[i, v] = 0 if seen[v] else state.missed[i, v] + 1
-            if max(state.missed[i, 0], state.missed[i, 1]) > par[11]:
-                _forget(i, state)
-        if not state.tracking[i]:
-            _edges_of(front[i], 0, e, s)
-            seen[0] = _search(0, mask_front, ref[0], lp, s, line)
-            lines[0] = line
-            _edges_of(side[i], 1, e, s)
-            seen[1] = _search(1, mask_side, ref[1], lp, s, line)
-            lines[1] = line
-            if not (seen[0] and seen[1] and _triangulate(lines, ref, g, p, d)):
-                for v in range(2):
-                    valid[i, v] = False
-                continue
-            _forget(i, state)
-            state.tracking[i] = True
-            state.variance[i, 0], state.variance[i, 1] = (2e-4) ** 2, (0.03) ** 2
-            along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
-            for k in range(3):
-                p[k] -= along * d[k]
+            known = _track(
+                i, front[i], side[i], mask_front, mask_side, tip, ref, g, e, lp, par, state, s, p, d
+            )
+        if not known:
+            known = _start(i, front[i], side[i], mask_front, mask_side, ref, g, e, lp, state, s, p, d)
+        if not known:
+            valid[i, 0] = valid[i, 1] = False
+            continue
         for a in range(3):
             state.point[i, a], state.direction[i, a] = tip[a, 3], 0.0
             for b in range(3):
@@ -612,7 +709,7 @@ class Perception:
         ref = views.reference
         self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
         self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.table
-        memory = max(int(round(cfg.memory_s / frame_s)), 1)
+        memory = max(round(cfg.memory_s / frame_s), 1)
         self._par = np.array(
             [
                 memory,
@@ -705,4 +802,5 @@ class Perception:
             self._scratch,
             *self._lines,
         )
-        return SeamLines(*(x.copy() for x in self._lines))
+        point, direction, valid = self._lines
+        return SeamLines(point.copy(), direction.copy(), valid.copy())

@@ -34,7 +34,7 @@ class LineCfg:
     """Parameters of the line stage.
 
     Attributes:
-        bright_side: +1 if the plate (larger column of the strip) is the brighter side, -1 if it is the darker.
+        bright_side: +1 if the plate (larger column of the strip) is the brighter side, -1 if the darker.
         hypotheses: Pairs of pixels that RANSAC tries.
         inlier_px: Largest distance of an inlier [px].
         max_slope: Of a line against the travel.
@@ -151,6 +151,83 @@ def _random(word: np.uint64) -> np.uint64:
 
 
 @kernel
+def _profile(grey: Grey, row: int, q: float, first: int, count: int, sign: float, profile: Array) -> bool:
+    """Mean of a few rows along the edge, brighter to the right; False without enough rows."""
+    height, width = grey.shape
+    for k in range(count):
+        profile[k] = 0.0
+    rows = 0
+    for y in range(max(row - _HALF_ROWS, 0), min(row + _HALF_ROWS + 1, height)):
+        shift = q * (y - row)
+        whole = int(np.floor(shift))
+        part = shift - whole
+        if first + whole < 0 or first + count + whole + 1 > width:
+            continue
+        rows += 1
+        for k in range(count):
+            x = first + k + whole
+            profile[k] += (1.0 - part) * grey[y, x] + part * grey[y, min(x + 1, width - 1)]
+    if rows < 2:
+        return False
+    for k in range(count):
+        profile[k] *= sign / (3.0 * rows)
+    return True
+
+
+@kernel
+def _boundary(profile: Array, count: int, first: int, o: float, search: float) -> int:
+    """The boundary between two pixels of a profile with the largest step up, or -1."""
+    best, where = 0.0, -1
+    for b in range(_FLANK, count - _FLANK + 1):
+        if abs(first + b - o) > search + 0.5:
+            continue
+        step = 0.0
+        for k in range(_FLANK):
+            step += profile[b + k] - profile[b - 1 - k]
+        if step > best:
+            best, where = step, b
+    return where
+
+
+@kernel
+def _place(profile: Array, count: int, where: int, found: Array) -> None:
+    """Sub-pixel place and step of the edge at a boundary of the profile."""
+    low = high = 0.0
+    n_low = n_high = 0
+    # The pixels beside the boundary hold the edge itself: the levels are those beyond them.
+    for k in range(1, _FLANK + 1):
+        if where - 1 - k >= 0:
+            low += profile[where - 1 - k]
+            n_low += 1
+        if where + k < count:
+            high += profile[where + k]
+            n_high += 1
+    low /= n_low
+    high /= n_high
+    found[0], found[1] = 0.0, high - low
+    if high <= low:
+        return
+    # Each pixel of the transition is on the darker side to the share that the edge lies behind it.
+    found[0] = where - 2.0
+    for k in range(where - 2, where + 2):
+        found[0] += 0.5 if k < 0 or k >= count else (high - profile[k]) / (high - low)
+
+
+@kernel
+def _allowed(mask: Mask, edge: Mask, row: int, column: int) -> bool:
+    """Whether the edge stage found an edge here, and the nozzle is not near."""
+    height, width = mask.shape
+    for y in range(max(row - 1, 0), min(row + 2, height)):
+        for x in range(max(column - 3, 0), min(column + 4, width)):
+            if mask[y, x]:
+                return False
+    seen = False
+    for x in range(max(column - 1, 0), min(column + 2, width)):
+        seen = seen or edge[row, x]
+    return bool(seen)
+
+
+@kernel
 def row_edge(
     grey: Grey,
     mask: Mask,
@@ -163,7 +240,7 @@ def row_edge(
     profile: Array,
     found: Array,
 ) -> bool:
-    """The edge nearest its expected place in a row, to a fraction of a pixel.
+    """The edge near its expected place in a row, to a fraction of a pixel.
 
     Args:
         grey: The strip's sum of channels.
@@ -181,83 +258,23 @@ def row_edge(
         Whether there is one.
     """
     height, width = grey.shape
-    if row < 0 or row >= height:
+    if row < 0 or row >= height or not abs(o) < 2.0 * width:
         return False
-    half = int(search) + 1
+    half = int(search) + 1 + _FLANK
     middle = int(np.floor(o + 0.5))  # a boundary between the pixels middle - 1 and middle
-    first, count = middle - half - _FLANK, 2 * (half + _FLANK)
-    if first < 0 or first + count > width:
-        # Near the border: as much of the search as there is.
-        first = max(first, 0)
-        count = min(middle + half + _FLANK, width) - first
-        if count < 2 * _FLANK:
-            return False
-    for k in range(count):
-        profile[k] = 0.0
-    rows = 0
-    for y in range(max(row - _HALF_ROWS, 0), min(row + _HALF_ROWS + 1, height)):
-        shift = q * (y - row)
-        whole = int(np.floor(shift))
-        part = shift - whole
-        if first + whole < 0 or first + count + whole + 1 > width:
-            continue
-        rows += 1
-        for k in range(count):
-            x = first + k + whole
-            x1 = min(x + 1, width - 1)
-            profile[k] += (1.0 - part) * grey[y, x] + part * grey[y, x1]
-    if rows < 2:
+    # Near the border: as much of the search as there is.
+    first, last = max(middle - half, 0), min(middle + half, width)
+    count = last - first
+    if count < 2 * _FLANK or not _profile(grey, row, q, first, count, par[0], profile):
         return False
-    sign = par[0] / (3.0 * rows)
-    for k in range(count):
-        profile[k] *= sign
-    best, where = 0.0, -1
-    for b in range(_FLANK, count - _FLANK + 1):
-        if abs(first + b - o) > search + 0.5:
-            continue
-        step = 0.0
-        for k in range(_FLANK):
-            step += profile[b + k] - profile[b - 1 - k]
-        if step > best:
-            best, where = step, b
+    where = _boundary(profile, count, first, o, search)
     if where < 0:
         return False
-    # The pixels beside the boundary hold the edge itself: the levels are those beyond them.
-    low = high = 0.0
-    n_low = n_high = 0
-    for k in range(2, _FLANK + 2):
-        if where - 1 - k + 1 >= 0:
-            low += profile[where - k]
-            n_low += 1
-        if where + k - 1 < count:
-            high += profile[where + k - 1]
-            n_high += 1
-    low /= n_low
-    high /= n_high
-    step = high - low
-    if step < par[5]:
+    _place(profile, count, where, found)
+    found[0] += first
+    if found[1] < par[5] or abs(found[0] - o) > search + 1.0:
         return False
-    # Each pixel of the transition is the darker side to the share that the edge lies behind it.
-    place = first + where - 2.0
-    for k in range(where - 2, where + 2):
-        if k < 0 or k >= count:
-            place += 0.5
-            continue
-        place += (high - profile[k]) / step
-    if abs(place - o) > search + 1.0:
-        return False
-    column = min(max(int(place), 0), width - 1)
-    for y in range(max(row - 1, 0), min(row + 2, height)):
-        for x in range(max(column - 3, 0), min(column + 4, width)):
-            if mask[y, x]:
-                return False
-    seen = False
-    for x in range(max(column - 1, 0), min(column + 2, width)):
-        seen = seen or edge[row, x]
-    if not seen:
-        return False
-    found[0], found[1] = place, step
-    return True
+    return bool(_allowed(mask, edge, row, min(max(int(found[0]), 0), width - 1)))
 
 
 @kernel
@@ -459,7 +476,7 @@ def ransac_line(
             n += 1
     if n < par[6]:
         return False
-    return _ransac(t, o, vote, n, par, np.uint64(int(par[9])), line) > 0.0
+    return bool(_ransac(t, o, vote, n, par, np.uint64(int(par[9])), line) > 0.0)
 
 
 @kernel
@@ -521,6 +538,7 @@ def _find_batch(
                 )
         edge_image(
             grey,
+            mask,
             tap,
             pad,
             edge_par,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from seal_gym.core.errors import ConfigError
-from seal_gym.vision.edges import EdgeCfg, EdgeStage, taps, weights
+from seal_gym.vision.edges import EdgeCfg, EdgeStage, EdgeTables, edge_image, taps, weights
 
 ALL = {"share": 1.0}
 
@@ -169,6 +169,27 @@ def test_batches_and_grey_images_give_the_same():
         for a, b, c in zip(many, EdgeStage()(image[k : k + 1]), colour, strict=True):
             np.testing.assert_array_equal(a[k], b[0])
             np.testing.assert_array_equal(a[k], c[k])
+
+
+def test_intensity_is_relative_to_what_is_outside_the_mask():
+    """A nozzle of any contrast leaves the seam's intensity as it is."""
+    tables = EdgeTables.of(EdgeCfg())
+    rng = np.random.default_rng(4)
+    grey = np.where(np.arange(50) < 20, 300, 400) + rng.integers(-20, 20, (100, 50))
+    mask = np.zeros(grey.shape, np.bool_)
+    mask[70:, 30:] = True
+    shapes = [np.zeros((104, 54)), np.zeros((100, 50)), np.zeros(512, np.int64)]
+
+    def run(image):
+        out = [np.zeros((100, 50)) for _ in range(5)] + [np.zeros((100, 50), np.bool_)]
+        edge_image(image, mask, *tables, *shapes, *out)
+        return out
+
+    plain, nozzle = run(grey), grey.copy()
+    nozzle[75:, 35:] = 765
+    for a, b in zip(plain, run(nozzle), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not plain[5][mask].any()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,182 @@
+"""The tracker on rendered seams: accuracy against the oracle, lost frames, resets, independence of rows."""
+
+import numpy as np
+import pytest
+
+from seal_gym.core.errors import ConfigError
+from seal_gym.core.frames import tip_rotation, transform
+from seal_gym.envs.config import SealCfg
+from seal_gym.envs.core import SealCore
+from seal_gym.vision.features import RoiFeatures, ViewGeometry, oracle_lines, update_features
+from seal_gym.vision.perception import Perception, PerceptionCfg
+from seal_gym.workpieces.seam import seam_in_world
+
+FRAME_S = 1 / 30
+
+
+class Ride:
+    """A gun carried along the seam at 10 mm/s with small errors, and what its cameras see."""
+
+    def __init__(self, part, seeds, start):
+        self.core = SealCore(SealCfg(workpiece=part, observation="features+images"), len(seeds))
+        self.views = ViewGeometry.of(self.core.cfg.cell)
+        for i, seed in enumerate(seeds):
+            self.core.reset(i, np.random.default_rng(seed))
+        self.s0, self.n = start, len(seeds)
+        self.phase = np.array(seeds) * 1.7
+
+    def perception(self, n=None, **kwargs):
+        nozzle = self.core.sensors.nozzle
+        return Perception(n or self.n, self.views, nozzle, FRAME_S, PerceptionCfg(**kwargs))
+
+    def frame(self, k):
+        """Images, tip poses and the oracle's lines of a frame."""
+        seam, s = self.core._seam, self.s0 + 0.01 * k * FRAME_S
+        at = seam.at(s)
+        nominal = transform(tip_rotation(at.tangent, at.approach), at.position + 0.003 * at.approach)
+        poses = []
+        for part, phase in zip(self.core.arm.part_pose, self.phase, strict=True):
+            wave = 3e-4 * np.array([np.sin(phase + 0.1 * k), 0.0, np.cos(phase + 0.07 * k)])
+            poses.append(part @ nominal @ transform(np.eye(3), wave))
+        tips = np.array(poses)
+        images = self.core.sensors.images(tips, self.core.arm, np.full(self.n, k))
+        point, tangent = seam_in_world(seam, np.full(self.n, s), self.core.arm.part_pose)
+        return images, tips, oracle_lines(point, tangent, tips, self.views)
+
+    def errors(self, lines, truth):
+        """d_px and theta_px of both views against the truth, deg."""
+        out = []
+        for each in (lines, truth):
+            features = RoiFeatures.zeros(self.n)
+            update_features(features, each, self.views)
+            assert features.valid.all()
+            out.append(np.concatenate((features.d_px, np.degrees(features.theta_px_rad)), axis=1))
+        return out[0] - out[1]
+
+
+def run(ride, frames, **kwargs):
+    eyes, errors = ride.perception(**kwargs), []
+    for k in range(frames):
+        images, tips, truth = ride.frame(k)
+        errors.append(ride.errors(eyes.update(images.front, images.side, tips), truth))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("part", ["flat", "cylinder", "rectangular"])
+def test_straights_and_wide_bends_within_the_targets(part):
+    error = run(Ride(part, range(6), 0.04), 60)[20:]
+    rms = np.sqrt((error**2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.2).all() and (rms[2:] <= 0.6).all()
+
+
+def test_a_corner_within_the_targets():
+    """From 10 mm before the corner's middle to 10 mm behind."""
+    error = run(Ride("rectangular", range(6), 0.095), 87)[27:]
+    rms = np.sqrt((error**2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.3).all() and (rms[2:] <= 2.0).all()
+
+
+def test_rows_never_mix_and_runs_repeat():
+    seeds = [3, 4, 5, 6, 7, 8, 9, 10]
+    ride = Ride("cylinder", seeds, 0.05)
+    many, again = ride.perception(), ride.perception()
+    single = [ride.perception(1) for _ in seeds]
+    for k in range(12):
+        images, tips, _ = ride.frame(k)
+        lines, repeated = (
+            many.update(images.front, images.side, tips),
+            again.update(images.front, images.side, tips),
+        )
+        for a, b in zip(lines, repeated, strict=True):
+            np.testing.assert_array_equal(a, b)
+        for i, eyes in enumerate(single):
+            one = eyes.update(images.front[i : i + 1], images.side[i : i + 1], tips[i : i + 1])
+            for a, b in zip(lines, one, strict=True):
+                np.testing.assert_array_equal(a[i], b[0])
+
+
+def test_only_rows_with_a_new_frame_look():
+    ride = Ride("flat", [1, 2], 0.05)
+    eyes, twin = ride.perception(), ride.perception(1)
+    images, tips, _ = ride.frame(0)
+    first = eyes.update(images.front, images.side, tips)
+    twin.update(images.front[:1], images.side[:1], tips[:1])
+    later, tips, _ = ride.frame(5)
+    second = eyes.update(later.front, later.side, tips, np.array([True, False]))
+    alone = twin.update(later.front[:1], later.side[:1], tips[:1])
+    for a, b, c in zip(first, second, alone, strict=True):
+        np.testing.assert_array_equal(a[1], b[1])
+        np.testing.assert_array_equal(b[0], c[0])
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_lost_frames_coast_for_a_while_and_are_then_invalid(view):
+    ride = Ride("cylinder", [1, 2, 3], 0.05)
+    eyes, valid = ride.perception(), []
+    for k in range(45):
+        images, tips, truth = ride.frame(k)
+        pictures = [images.front.copy(), images.side.copy()]
+        if 15 <= k < 30:
+            pictures[view][:] = 130
+        lines = eyes.update(*pictures, tips)
+        valid.append(lines.valid.all())
+        if 15 <= k < 24:  # 0.3 s
+            assert lines.valid.all()
+            assert np.abs(ride.errors(lines, truth)[:, :2]).max() < 2.5  # 3 mm on a radius of 70 mm
+        elif 24 <= k < 30:
+            assert not lines.valid.any()
+    assert all(valid[:24]) and all(valid[31:])
+    assert np.abs(ride.errors(lines, truth)[:, :2]).max() < 0.6
+
+
+def test_a_seam_that_was_never_seen_is_invalid_and_harmless():
+    ride = Ride("flat", [1], 0.05)
+    eyes = ride.perception()
+    _, tips, _ = ride.frame(0)
+    rng = np.random.default_rng(0)
+    for level in (0, 100, 255):
+        for sigma in (0, 8):
+            front = np.clip(rng.normal(level, sigma, (1, 100, 50, 1)), 0, 255).astype(np.uint8).repeat(3, 3)
+            side = np.clip(rng.normal(level, sigma, (1, 50, 100, 1)), 0, 255).astype(np.uint8).repeat(3, 3)
+            lines = eyes.update(front, side, tips)
+            assert not lines.valid.any()
+            assert np.isfinite(lines.point).all() and np.isfinite(lines.direction).all()
+
+
+def test_a_reset_forgets_everything():
+    ride = Ride("rectangular", [1], 0.05)
+    used, new = ride.perception(), ride.perception()
+    for k in range(8):
+        images, tips, _ = ride.frame(k)
+        used.update(images.front, images.side, tips)
+    used.reset(0)
+    for k in range(20, 24):
+        images, tips, _ = ride.frame(k)
+        a, b = used.update(images.front, images.side, tips), new.update(images.front, images.side, tips)
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_a_part_that_is_shoved_is_found_again():
+    ride = Ride("flat", [1, 2, 3], 0.05)
+    eyes = ride.perception()
+    for k in range(30):
+        if k == 15:
+            ride.core.arm.part_pose[:, :2, 3] += 6e-4
+        images, tips, truth = ride.frame(k)
+        # The gun follows the part in this ride: only the world's seam jumps.
+        lines = eyes.update(images.front, images.side, tips)
+    assert np.abs(ride.errors(lines, truth)[:, :2]).max() < 0.5
+
+
+@pytest.mark.parametrize("name", ["coast_s", "memory_s", "sigma_m", "gate"])
+def test_bad_parameters_are_refused(name):
+    with pytest.raises(ConfigError, match=name):
+        PerceptionCfg(**{name: 0.0})
+
+
+def test_views_of_other_shapes_are_refused():
+    ride = Ride("flat", [1], 0.05)
+    odd = ride.views._replace(size=np.array([[50.0, 100.0], [90.0, 50.0]]))
+    with pytest.raises(ConfigError, match="ROIs"):
+        Perception(1, odd, ride.core.sensors.nozzle, FRAME_S)
