@@ -10,10 +10,11 @@ from seal_gym.envs.core import SealCore
 
 
 def main() -> None:
-    """Runs one frame with images in every control mode."""
+    """Runs two frames with images and vision in every control mode."""
     for control in ("tip", "rmp", "joint"):
-        core = SealCore(SealCfg.of(control=control, observation="features+images"), 1)
+        core = SealCore(SealCfg.of(control=control, perception="vision", observation="features+images"), 1)
         core.reset(0, np.random.default_rng(0))
+        core.observe()
         core.step(np.zeros((1, core.adapter.size)))
         core.observe()
 
