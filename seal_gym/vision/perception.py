@@ -6,7 +6,8 @@ a seam at rest does not jump. Each frame then
 1. follows the front view's edge ahead from where the tangent is expected, and remembers its pixels as rays in
    the world: the nozzle hides the seam behind the tip, but the memory holds it, which corners need;
 2. meets the rays with the plate's plane through the tangent and fits a quadratic to what lies within a few
-   millimetres of the tip; its tangent at the point nearest the tip is the new one;
+   millimetres of the tip; its tangent at the point nearest the tip is the new one; where new edges lie beside
+   remembered ones the part has moved, and an alpha-beta filter moves the memory with it;
 3. looks for that curve in the side view, whose offset and slope correct the plane's height and pitch by a
    Kalman filter each, with gating.
 
@@ -32,6 +33,7 @@ Bools = NDArray[np.bool_]
 
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _ROOT_HALF = float(np.sqrt(0.5))
+_STRETCHES = 20  # of the memory around the tip, in which new and old edges are compared
 _MIN_ROWS = 8  # with an edge, for a view to count as seen
 _HEIGHT_START, _PITCH_START = 0.2 * _MM, 0.03
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
@@ -56,6 +58,8 @@ class PerceptionCfg:
         height_q_m: Drift of the plane's height from frame to frame [m].
         pitch_q_rad: Drift of its pitch [rad].
         gate: Measurements this many standard deviations off are not believed.
+        follow_gain: Share of the new edges' drift against the memory by which the memory follows.
+        velocity_gain: Share of that drift added to the part's velocity a frame.
     """
 
     edges: EdgeCfg = field(default_factory=EdgeCfg)
@@ -66,17 +70,20 @@ class PerceptionCfg:
     sigma_m: float = 2.0 * _MM
     bend: float = 80.0
     clip_m: float = 0.15 * _MM
-    jump_m: float = 0.4 * _MM
+    jump_m: float = 0.8 * _MM
     row_sigma_m: float = 3.0 * _MM
     side_px: float = 18.0
     height_q_m: float = 0.01 * _MM
     pitch_q_rad: float = 0.1 * _DEG
     gate: float = 5.0
+    follow_gain: float = 0.4
+    velocity_gain: float = 0.1
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         for name in ("coast_s", "memory_s", "ahead_px", "sigma_m", "bend", "clip_m", "jump_m", "row_sigma_m",
-                     "side_px", "height_q_m", "pitch_q_rad", "gate"):  # fmt: skip
+                     "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
+                     "velocity_gain"):  # fmt: skip
             value = getattr(self, name)
             require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
 
@@ -90,6 +97,7 @@ class _State(NamedTuple):
     tracking: Bools  # (N,)
     missed: NDArray[np.int64]  # frames without the seam, (N, 2)
     clock: NDArray[np.int64]  # frames since the reset, (N,)
+    velocity: Array  # of the part across the seam, world, (N, 3), m a frame
     eye: Array  # remembered rays: optical centre, world, (N, K, 3), m
     ray: Array  # direction, (N, K, 3)
     weight: Array  # (N, K)
@@ -276,23 +284,20 @@ def _triangulate(lines: Array, ref: Array, g: ViewGeometry, p: Array, d: Array) 
 
 
 @kernel
-def _fit_memory(
+def _gather(
     i: int,
     tip: Array,
     p: Array,
     d: Array,
     n: Array,
     m: Array,
+    sigma: float,
     oldest: int,
-    par: Array,
     state: _State,
     fit: Array,
-    curve: Array,
-) -> float:
-    """Fits the remembered rays near the tip in the plate's plane; returns the curve's residual now [m]."""
-    sigma, bend, clip = par[2], par[3], par[4]
-    count = fresh = 0
-    now = state.clock[i]
+) -> int:
+    """Where the remembered rays meet the plate near the tip: along (in sigma), across, weight, newness."""
+    count = 0
     c, r = np.empty(3), np.empty(3)
     for k in range(state.stamp.shape[1]):
         if state.stamp[i, k] < oldest:
@@ -315,21 +320,76 @@ def _fit_memory(
             continue
         fit[0, count], fit[1, count] = along / sigma, across
         fit[2, count] = state.weight[i, k] * np.exp(-0.5 * (along / sigma) ** 2)
-        fit[3, count] = 1.0 if state.stamp[i, k] == now else 0.0
-        fresh += int(fit[3, count])
+        fit[3, count] = 1.0 if state.stamp[i, k] == state.clock[i] else 0.0
         count += 1
-    prior = 1.0 / (bend * sigma * sigma) ** 2
-    if count < _MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
-        return -1.0
-    off = weight = 0.0
+    return count
+
+
+@kernel
+def _drift(fit: Array, count: int, curve: Array) -> float:
+    """How far the new edges lie beside the remembered ones, stretch by stretch about a common curve [m]."""
+    old, new = np.zeros((2, _STRETCHES)), np.zeros((2, _STRETCHES))
     for k in range(count):
-        w = fit[2, k] * fit[3, k]
-        y = fit[0, k]
-        off += w * (fit[1, k] - curve[0] - (curve[1] + curve[2] * y) * y)
-        weight += w
+        y, w = fit[0, k], fit[2, k]
+        stretch = min(int((y + 2.5) * (_STRETCHES / 5.0)), _STRETCHES - 1)
+        off = fit[1, k] - curve[0] - (curve[1] + curve[2] * y) * y
+        if fit[3, k] > 0.0:
+            new[0, stretch] += w
+            new[1, stretch] += w * off
+        else:
+            old[0, stretch] += w
+            old[1, stretch] += w * off
+    total = weight = 0.0
+    for k in range(_STRETCHES):
+        if old[0, k] > 0.0 and new[0, k] > 0.0:
+            w = old[0, k] * new[0, k] / (old[0, k] + new[0, k])
+            total += w * (new[1, k] / new[0, k] - old[1, k] / old[0, k])
+            weight += w
+    return float(total / weight) if weight > 0.0 else 0.0
+
+
+@kernel
+def _fit_memory(
+    i: int,
+    tip: Array,
+    p: Array,
+    d: Array,
+    n: Array,
+    m: Array,
+    oldest: int,
+    par: Array,
+    state: _State,
+    fit: Array,
+    curve: Array,
+) -> bool:
+    """Fits what is remembered near the tip in the plate's plane, and learns how the part moves across."""
+    sigma, clip = par[2], par[4]
+    prior = 1.0 / (par[3] * sigma * sigma) ** 2
+    count = _gather(i, tip, p, d, n, m, sigma, oldest, state, fit)
+    if count < _MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
+        return False
+    off = _drift(fit, count, curve)
+    if abs(off) > par[5]:
+        # Not the same seam, or a part that was shoved: only the new edges count.
+        for k in range(state.stamp.shape[1]):
+            if state.stamp[i, k] != state.clock[i]:
+                state.stamp[i, k] = -1
+        for k in range(count):
+            fit[2, k] *= fit[3, k]
+    else:
+        for a in range(3):
+            across = tip[a, 0] * m[0] + tip[a, 1] * m[1] + tip[a, 2] * m[2]
+            state.velocity[i, a] += par[13] * off * across
+            for k in range(state.stamp.shape[1]):
+                if state.stamp[i, k] != state.clock[i]:
+                    state.eye[i, k, a] += par[12] * off * across
+        for k in range(count):
+            fit[1, k] += par[12] * off * (1.0 - fit[3, k])
+    if fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
+        return False
     curve[1] /= sigma
     curve[2] /= sigma * sigma
-    return abs(off) / weight if weight > 0.0 else 0.0
+    return True
 
 
 @kernel
@@ -392,13 +452,7 @@ def _track_front(
     _remember(i, tip, count, ref, g, par, state, s)
     _plate(d, n, m)
     oldest = max(state.clock[i] - int(par[0]), 0)
-    off = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
-    if off > par[5]:
-        for k in range(state.stamp.shape[1]):
-            if state.stamp[i, k] != state.clock[i]:
-                state.stamp[i, k] = -1
-        off = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
-    if off < 0.0:
+    if not _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve):
         return False
     # The curve's point nearest the tip, the origin: |p + y d + x(y) m| is least.
     pd = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
@@ -548,6 +602,8 @@ def _track_side(
 def _forget(i: int, state: _State) -> None:
     state.tracking[i] = False
     state.missed[i, 0] = state.missed[i, 1] = 0
+    for a in range(3):
+        state.velocity[i, a] = 0.0
     for k in range(state.stamp.shape[1]):
         state.stamp[i, k] = -1
 
@@ -579,6 +635,10 @@ def _track(
     d: Array,
 ) -> bool:
     """Carries a track on by a frame; False when it is given up."""
+    for a in range(3):
+        state.point[i, a] += state.velocity[i, a]
+        for k in range(state.stamp.shape[1]):
+            state.eye[i, k, a] += state.velocity[i, a]
     for a in range(3):
         p[a] = d[a] = 0.0
         for b in range(3):
@@ -724,6 +784,8 @@ class Perception:
                 cfg.pitch_q_rad,
                 cfg.gate,
                 cfg.coast_s / frame_s + 1e-9,
+                cfg.follow_gain,
+                cfg.velocity_gain,
             ],
             dtype=np.float64,
         )
@@ -735,6 +797,7 @@ class Perception:
             tracking=np.zeros(n, np.bool_),
             missed=np.zeros((n, 2), np.int64),
             clock=np.zeros(n, np.int64),
+            velocity=np.zeros((n, 3)),
             eye=np.zeros((n, rays, 3)),
             ray=np.zeros((n, rays, 3)),
             weight=np.zeros((n, rays)),
