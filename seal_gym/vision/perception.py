@@ -65,7 +65,7 @@ class PerceptionCfg:
     edges: EdgeCfg = field(default_factory=EdgeCfg)
     line: LineCfg = field(default_factory=LineCfg)
     coast_s: float = 0.3
-    memory_s: float = 1.0
+    memory_s: float = 0.7
     ahead_px: float = 26.0
     sigma_m: float = 2.0 * _MM
     bend: float = 80.0

@@ -180,3 +180,18 @@ def test_views_of_other_shapes_are_refused():
     odd = ride.views._replace(size=np.array([[50.0, 100.0], [90.0, 50.0]]))
     with pytest.raises(ConfigError, match="ROIs"):
         Perception(1, odd, ride.core.sensors.nozzle, FRAME_S)
+
+
+@pytest.mark.parametrize("part", ["flat", "cylinder"])
+def test_the_memory_follows_a_part_that_moves(part):
+    """At 10 mm/s, in any direction; without following, the seam is off by 0.6 px and 5 deg."""
+    ride = Ride(part, range(6), 0.05)
+    base, eyes, errors = ride.core.arm.part_pose.copy(), ride.perception(), []
+    phase = np.arange(6) * 1.05
+    for k in range(75):
+        ride.core.arm.part_pose[:, 0, 3] = base[:, 0, 3] + 0.02 * np.sin(0.5 * k * FRAME_S + phase)
+        ride.core.arm.part_pose[:, 1, 3] = base[:, 1, 3] + 0.02 * np.cos(0.5 * k * FRAME_S + phase)
+        images, tips, truth = ride.frame(k)
+        errors.append(ride.errors(eyes.update(images.front, images.side, tips), truth))
+    rms = np.sqrt((np.array(errors[25:]) ** 2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.3).all() and (rms[2:] <= 2.0).all()
