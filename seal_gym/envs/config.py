@@ -11,10 +11,11 @@ from seal_gym.envs.adapters import CONTROLS, LeafFunction, check_leaf_function
 from seal_gym.sim.look import LookCfg
 from seal_gym.tasks.progress import SealTaskCfg
 from seal_gym.tasks.reward import RewardCfg
+from seal_gym.vision.perception import PerceptionCfg
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.workpiece import Workpiece
 
-PERCEPTIONS = ("oracle", "vision")
+PERCEPTIONS = ("vision", "oracle")
 OBSERVATIONS = ("features", "features+images")
 RENDERERS = ("raycast", "gl")
 
@@ -50,28 +51,30 @@ class SealCfg:
         workpiece: A name (``flat``, ``cylinder``, ``rectangular``) or a ``Workpiece``.
         control: ``"tip"`` (6 tip accelerations), ``"rmp"`` (6 f and 21 Cholesky entries of A) or ``"joint"``
             (6 joint accelerations); all in [-1, 1].
-        perception: ``"oracle"``: the ROI features from the true geometry through the calibrated cameras;
-            ``"vision"``: from the sensor images.
+        perception: ``"vision"``: the ROI features from the sensor images; ``"oracle"``: from the true
+            geometry through the calibrated cameras, without images.
         observation: ``"features"`` or ``"features+images"``.
         renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
         sealant: ``False``: this version simulates the gun's motion, not the sealant.
         leaves: Extra RMP leaves resolved with the policy's, with ``control="rmp"``.
         task: Outcomes and displacements.
         reward: Weights of the reward.
+        vision: Parameters of edge stage, line stage and tracker.
         look: Ranges of light, exposure, texture, blur and noise of the sensor images.
         cell: Calibration.
-        threads: Threads for physics and images of a vector of environments.
+        threads: Threads for physics, images and vision of a vector of environments.
     """
 
     workpiece: str | Workpiece = "flat"
     control: str = "tip"
-    perception: str = "oracle"
+    perception: str = "vision"
     observation: str = "features"
     renderer: str = "raycast"
     sealant: bool = False
     leaves: tuple[LeafFunction, ...] = ()
     task: SealTaskCfg = field(default_factory=SealTaskCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
+    vision: PerceptionCfg = field(default_factory=PerceptionCfg)
     look: LookCfg = field(default_factory=LookCfg)
     cell: CellCfg = field(default_factory=load_cell)
     threads: int = 1
@@ -79,7 +82,13 @@ class SealCfg:
     def __post_init__(self) -> None:
         """Checks the choices."""
         catalogue.get(self.workpiece)
-        kinds = {"task": SealTaskCfg, "reward": RewardCfg, "look": LookCfg, "cell": CellCfg}
+        kinds = {
+            "task": SealTaskCfg,
+            "reward": RewardCfg,
+            "vision": PerceptionCfg,
+            "look": LookCfg,
+            "cell": CellCfg,
+        }
         for name, kind in kinds.items():
             value = getattr(self, name)
             require(isinstance(value, kind), f"{name} = {value!r}: must be a {kind.__name__}")

@@ -113,9 +113,6 @@ class SealCore:
         self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
         self.sensors = Sensors(self.scene, cfg, n)
         self._views = ViewGeometry.of(cell)
-        self._vision: Perception | None = None
-        if cfg.perception == "vision":
-            self._vision = Perception(n, self._views, self.sensors.nozzle, cell.timing.frame_s)
         self._images: Images | None = None
         self._rate = SeamRate(n, cell.timing.frame_s)
         self.features = RoiFeatures.zeros(n)
@@ -131,9 +128,22 @@ class SealCore:
             tip_rotation(start.tangent, start.approach),
             start.position + cell.process.stand_off_m * start.approach,
         )
+        self._vision = self._eyes() if cfg.perception == "vision" else None
         self._lean_taught = float(np.arctan2(self._start[2, 0], self._start[2, 2]))
         nominal_s = self._seam.length / cell.process.speed_m_s
         self.time_limit = int(np.ceil(task.time_factor * nominal_s * cell.timing.frame_rate_hz))
+
+    def _eyes(self) -> Perception:
+        cfg = self.cfg
+        return Perception(
+            self.n,
+            self._views,
+            self.sensors.nozzle,
+            cfg.cell.timing.frame_s,
+            cfg.vision,
+            plate=self._start[2, :3],  # the part's z axis in the taught tip frame
+            threads=cfg.threads,
+        )
 
     # -- spaces -----------------------------------------------------------------------------------------
 

@@ -6,9 +6,6 @@ and integers are used, without fast-math, so the same poses give the same bytes 
 """
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +15,7 @@ from seal_gym.core.cell import CameraCfg, CellCfg
 from seal_gym.core.errors import RenderError, require
 from seal_gym.core.frames import Array, cross
 from seal_gym.core.jit import kernel
+from seal_gym.core.parallel import split
 from seal_gym.sim import texture
 from seal_gym.sim.look import MAX_BLUR_PX, Look
 from seal_gym.workpieces.surface import MATERIALS, Surface
@@ -886,16 +884,6 @@ def _view_of(number: int, camera: CameraCfg, tool: Array) -> _View:
     )
 
 
-@lru_cache(maxsize=4)
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="seal_gym_raycast")
-
-
-# A forked child has none of the parent's threads and would wait for them for ever.
-if hasattr(os, "register_at_fork"):  # not on Windows, which does not fork
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
 class Raycaster:
     """Draws the ROI images of one part for any number of simulations.
 
@@ -970,10 +958,5 @@ class Raycaster:
                 _render_batch(self._mesh, view, look, counters, tip, part, first, last, *room, image, var)
             self._rooms.append(rooms)
 
-        parts = min(threads, n)
-        if parts <= 1:
-            draw(0, n)
-        else:
-            bounds = [n * k // parts for k in range(parts + 1)]
-            list(_pool(parts).map(draw, bounds[:-1], bounds[1:]))
+        split(draw, n, threads)
         return Images(images[0], images[1], _snr_db(np.ascontiguousarray(variance.T), look.noise_sigma))

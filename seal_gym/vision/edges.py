@@ -11,7 +11,7 @@
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,22 @@ class EdgeMap(NamedTuple):
     orientation: Array
     intensity: Array
     edge: NDArray[np.bool_]
+
+
+class EdgeDetector(Protocol):
+    """Anything that finds edges in images: the fractional-order stage, or a classical method."""
+
+    def __call__(self, images: Bytes, mask: NDArray[np.bool_] | None = None) -> EdgeMap:
+        """Finds the edges.
+
+        Args:
+            images: Grey, shape (N, height, width), or RGB, shape (N, height, width, 3).
+            mask: Where nothing may be an edge, shape (height, width).
+
+        Returns:
+            The edges.
+        """
+        ...
 
 
 def weights(alpha: float, length: int) -> Array:

@@ -24,15 +24,25 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
-from seal_gym.vision.edges import EdgeCfg, EdgeTables, edge_image
+from seal_gym.core.parallel import split
+from seal_gym.vision.edges import EdgeCfg, EdgeDetector, EdgeTables, edge_image
 from seal_gym.vision.features import MIN_SEEN_PX, SeamLines, ViewGeometry, _length_inside
-from seal_gym.vision.seam_line import LineCfg, dilated, fit_curve, follow, local_line, ransac_line, row_edge
+from seal_gym.vision.seam_line import (
+    LineCfg,
+    dilated,
+    fit_curve,
+    follow,
+    local_line,
+    ransac_line,
+    row_edge,
+    strips,
+)
 
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
-_ROOT_HALF = float(np.sqrt(0.5))
+_FILLET_PLATE = np.array([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
 _STRETCHES = 20  # of the memory around the tip, in which new and old edges are compared
 _MIN_ROWS = 8  # with an edge, for a view to count as seen
 _HEIGHT_START, _PITCH_START = 0.2 * _MM, 0.03
@@ -88,6 +98,41 @@ class PerceptionCfg:
             require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
 
 
+class _Par(NamedTuple):
+    """``PerceptionCfg``'s numbers as the kernels take them, times in frames, and the plate's normal."""
+
+    memory: float
+    ahead_px: float
+    sigma_m: float
+    bend: float
+    clip_m: float
+    jump_m: float
+    row_sigma_m: float
+    side_px: float
+    height_q_m: float
+    pitch_q_rad: float
+    gate: float
+    coast: float
+    follow_gain: float
+    velocity_gain: float
+    plate_x: float
+    plate_y: float
+    plate_z: float
+
+    @classmethod
+    def of(cls, cfg: PerceptionCfg, frame_s: float, plate: Array) -> "_Par":
+        same = {name: float(getattr(cfg, name)) for name in cls._fields if hasattr(cfg, name)}
+        x, y, z = (float(v) for v in plate)
+        return cls(
+            **same,
+            memory=float(max(round(cfg.memory_s / frame_s), 1)),
+            coast=cfg.coast_s / frame_s + 1e-9,
+            plate_x=x,
+            plate_y=y,
+            plate_z=z,
+        )
+
+
 class _State(NamedTuple):
     """What is remembered of N simulations."""
 
@@ -103,6 +148,21 @@ class _State(NamedTuple):
     weight: Array  # (N, K)
     stamp: NDArray[np.int64]  # frame of each, -1 for none, (N, K)
     head: NDArray[np.int64]  # where the next ray goes, (N,)
+
+
+class _Maps(NamedTuple):
+    """What another edge method found in N simulations' strips; without one, arrays of no rows."""
+
+    edge: tuple[Bools, Bools]  # (N, length, width) of each view
+    intensity: tuple[Array, Array]
+    vector: tuple[Array, Array]  # across and along the strip, (N, length, width, 2)
+
+
+_OWN = _Maps(
+    edge=(np.zeros((0, 1, 1), np.bool_),) * 2,
+    intensity=(np.zeros((0, 1, 1)),) * 2,
+    vector=(np.zeros((0, 1, 1, 2)),) * 2,
+)
 
 
 class _Scratch(NamedTuple):
@@ -122,6 +182,26 @@ class _Scratch(NamedTuple):
     points: Array
     columns: Array
     fit: Array
+
+    @classmethod
+    def of(cls, length: int, width: int, pad: int, rays: int) -> "_Scratch":
+        shape = (length, width)
+        return cls(
+            grey=np.empty(shape, np.int64),
+            padded=np.empty((length + 2 * pad, width + 2 * pad)),
+            work=np.empty(shape),
+            bins=np.empty(512, np.int64),
+            ex=np.empty(shape),
+            ey=np.empty(shape),
+            magnitude=np.empty(shape),
+            orientation=np.empty(shape),
+            intensity=np.empty(shape),
+            edge=np.empty(shape, np.bool_),
+            profile=np.empty(64),
+            points=np.empty((2 * length, 3)),
+            columns=np.empty((3, 2 * length)),
+            fit=np.empty((4, rays)),
+        )
 
 
 @kernel
@@ -200,8 +280,14 @@ def _emit(
 
 
 @kernel
-def _edges_of(image: Bytes, view: int, mask: Bools, e: EdgeTables, s: _Scratch) -> None:
+def _edges_of(i: int, image: Bytes, view: int, mask: Bools, e: EdgeTables, maps: _Maps, s: _Scratch) -> None:
     _grey_strip(image, view, s.grey)
+    if i < len(maps.edge[view]):
+        s.edge[:] = maps.edge[view][i]
+        s.intensity[:] = maps.intensity[view][i]
+        s.ex[:] = maps.vector[view][i, :, :, 0]
+        s.ey[:] = maps.vector[view][i, :, :, 1]
+        return
     edge_image(
         s.grey,
         mask,
@@ -222,13 +308,13 @@ def _edges_of(image: Bytes, view: int, mask: Bools, e: EdgeTables, s: _Scratch) 
 
 
 @kernel
-def _search(view: int, mask: Bools, ref: Array, par: Array, s: _Scratch, line: Array) -> bool:
+def _search(view: int, mask: Bools, ref: Array, lp: Array, s: _Scratch, line: Array) -> bool:
     """A line without knowing where to look."""
     raw = np.empty(2)
-    if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], par, raw):
+    if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], lp, raw):
         return False
-    n = follow(s.grey, mask, s.edge, ref[0], raw[0], raw[1], par[8], par[8], par, s.profile, s.points)
-    return bool(local_line(s.points, n, ref[0], ref[1], raw[0], par, s.columns, line) > 0.0)
+    n = follow(s.grey, mask, s.edge, ref[0], raw[0], raw[1], lp[8], lp[8], lp, s.profile, s.points)
+    return bool(local_line(s.points, n, ref[0], ref[1], raw[0], lp, s.columns, line) > 0.0)
 
 
 @kernel
@@ -239,12 +325,9 @@ def _normalise(v: Array) -> None:
 
 
 @kernel
-def _plate(d: Array, n: Array, m: Array) -> None:
-    """Normal n of the plate's plane through a tangent d, and its m across, both in the tip frame.
-
-    The nozzle halves the right angle of wall (on the left) and plate.
-    """
-    n[0], n[1], n[2] = -_ROOT_HALF, 0.0, _ROOT_HALF
+def _plate(d: Array, par: _Par, n: Array, m: Array) -> None:
+    """Normal n of the plate's plane through a tangent d, and its m across, both in the tip frame."""
+    n[0], n[1], n[2] = par.plate_x, par.plate_y, par.plate_z
     along = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
     for k in range(3):
         n[k] -= along * d[k]
@@ -357,19 +440,19 @@ def _fit_memory(
     n: Array,
     m: Array,
     oldest: int,
-    par: Array,
+    par: _Par,
     state: _State,
     fit: Array,
     curve: Array,
 ) -> bool:
     """Fits what is remembered near the tip in the plate's plane, and learns how the part moves across."""
-    sigma, clip = par[2], par[4]
-    prior = 1.0 / (par[3] * sigma * sigma) ** 2
+    sigma, clip = par.sigma_m, par.clip_m
+    prior = 1.0 / (par.bend * sigma * sigma) ** 2
     count = _gather(i, tip, p, d, n, m, sigma, oldest, state, fit)
     if count < _MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
     off = _drift(fit, count, curve)
-    if abs(off) > par[5]:
+    if abs(off) > par.jump_m:
         # Not the same seam, or a part that was shoved: only the new edges count.
         for k in range(state.stamp.shape[1]):
             if state.stamp[i, k] != state.clock[i]:
@@ -379,12 +462,12 @@ def _fit_memory(
     else:
         for a in range(3):
             across = tip[a, 0] * m[0] + tip[a, 1] * m[1] + tip[a, 2] * m[2]
-            state.velocity[i, a] += par[13] * off * across
+            state.velocity[i, a] += par.velocity_gain * off * across
             for k in range(state.stamp.shape[1]):
                 if state.stamp[i, k] != state.clock[i]:
-                    state.eye[i, k, a] += par[12] * off * across
+                    state.eye[i, k, a] += par.follow_gain * off * across
         for k in range(count):
-            fit[1, k] += par[12] * off * (1.0 - fit[3, k])
+            fit[1, k] += par.follow_gain * off * (1.0 - fit[3, k])
     if fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
     curve[1] /= sigma
@@ -394,7 +477,7 @@ def _fit_memory(
 
 @kernel
 def _remember(
-    i: int, tip: Array, count: int, ref: Array, g: ViewGeometry, par: Array, state: _State, s: _Scratch
+    i: int, tip: Array, count: int, ref: Array, g: ViewGeometry, par: _Par, state: _State, s: _Scratch
 ) -> None:
     """Keeps every second of the points followed in the front view as rays in the world."""
     ray = np.empty(3)
@@ -407,7 +490,7 @@ def _remember(
             for b in range(3):
                 state.eye[i, h, a] += tip[a, b] * g.position[0, b]
                 state.ray[i, h, a] += tip[a, b] * ray[b]
-        state.weight[i, h] = (s.points[k, 2] / par[6]) ** 2
+        state.weight[i, h] = (s.points[k, 2] / par.row_sigma_m) ** 2
         state.stamp[i, h] = state.clock[i]
         state.head[i] = (h + 1) % state.stamp.shape[1]
 
@@ -420,7 +503,7 @@ def _track_front(
     ref: Array,
     g: ViewGeometry,
     lp: Array,
-    par: Array,
+    par: _Par,
     state: _State,
     s: _Scratch,
     p: Array,
@@ -441,8 +524,8 @@ def _track_front(
         ref[0],
         line[1] + q * (ref[0] - line[0]),
         q,
-        par[1],
-        par[1],
+        par.ahead_px,
+        par.ahead_px,
         lp,
         s.profile,
         s.points,
@@ -450,8 +533,8 @@ def _track_front(
     if count < _MIN_ROWS:
         return False
     _remember(i, tip, count, ref, g, par, state, s)
-    _plate(d, n, m)
-    oldest = max(state.clock[i] - int(par[0]), 0)
+    _plate(d, par, n, m)
+    oldest = max(state.clock[i] - int(par.memory), 0)
     if not _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve):
         return False
     # The curve's point nearest the tip, the origin: |p + y d + x(y) m| is least.
@@ -503,7 +586,7 @@ def _side_residual(
     mask: Bools,
     g: ViewGeometry,
     lp: Array,
-    par: Array,
+    par: _Par,
     s: _Scratch,
     p: Array,
     d: Array,
@@ -517,7 +600,7 @@ def _side_residual(
     b, x, found = np.empty(2), np.empty(3), np.empty(2)
     count = 0
     s0 = s1 = s2 = b0 = b1 = 0.0
-    for row in range(int(line[0] - par[7]), int(line[0] + par[7]) + 1):
+    for row in range(int(line[0] - par.side_px), int(line[0] + par.side_px) + 1):
         t = row + 0.5 - line[0]
         y = t / scale
         for _ in range(2):
@@ -534,7 +617,7 @@ def _side_residual(
             continue
         error = found[0] - b[1]
         # Far rows hang on the curve's bend, which is less sure.
-        w = found[1] * found[1] / (1.0 + (2.0 * t / par[7]) ** 4)
+        w = found[1] * found[1] / (1.0 + (2.0 * t / par.side_px) ** 4)
         s0 += w
         s1 += w * t
         s2 += w * t * t
@@ -567,7 +650,7 @@ def _track_side(
     mask: Bools,
     g: ViewGeometry,
     lp: Array,
-    par: Array,
+    par: _Par,
     state: _State,
     s: _Scratch,
     p: Array,
@@ -577,20 +660,20 @@ def _track_side(
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     per_m, out = np.empty(2), np.empty(4)
-    _plate(d, n, m)
+    _plate(d, par, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
     if not _side_residual(mask, g, lp, par, s, p, d, m, bend, line, per_m[0], out):
         return False
     # Neighbouring rows share pixels: five times the variance of independent ones.
-    noise = 5.0 * par[6] ** 2
+    noise = 5.0 * par.row_sigma_m**2
     r_height = noise * out[2] + _HEIGHT_FLOOR**2
     r_pitch = noise * out[3] * per_m[0] ** 2 + _PITCH_FLOOR**2
     variance = state.variance[i]
-    height = _kalman(variance, 0, par[8], out[0] / per_m[1], r_height, par[10])
+    height = _kalman(variance, 0, par.height_q_m, out[0] / per_m[1], r_height, par.gate)
     if height == 0.0:
         return False
-    pitch = _kalman(variance, 1, par[9], out[1] / per_m[1] * per_m[0], r_pitch, par[10])
+    pitch = _kalman(variance, 1, par.pitch_q_rad, out[1] / per_m[1] * per_m[0], r_pitch, par.gate)
     for k in range(3):
         p[k] += height * lift[k]
         d[k] += pitch * lift[k]
@@ -627,8 +710,9 @@ def _track(
     ref: Array,
     g: ViewGeometry,
     e: EdgeTables,
+    maps: _Maps,
     lp: Array,
-    par: Array,
+    par: _Par,
     state: _State,
     s: _Scratch,
     p: Array,
@@ -646,18 +730,18 @@ def _track(
             d[a] += tip[b, a] * state.direction[i, b]
     _nearest(p, d)
     curve = np.zeros(3)
-    _edges_of(front, 0, mask_front, e, s)
+    _edges_of(i, front, 0, mask_front, e, maps, s)
     if _track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve):
         state.missed[i, 0] = 0
     else:
         state.missed[i, 0] += 1
         curve[2] = 0.0
-    _edges_of(side, 1, mask_side, e, s)
+    _edges_of(i, side, 1, mask_side, e, maps, s)
     if _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2]):
         state.missed[i, 1] = 0
     else:
         state.missed[i, 1] += 1
-    return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par[11])
+    return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par.coast)
 
 
 @kernel
@@ -670,6 +754,7 @@ def _start(
     ref: Array,
     g: ViewGeometry,
     e: EdgeTables,
+    maps: _Maps,
     lp: Array,
     state: _State,
     s: _Scratch,
@@ -679,11 +764,11 @@ def _start(
     """Looks for a seam that is not tracked; False if the views show none."""
     _forget(i, state)
     line, lines = np.empty(3), np.empty((2, 3))
-    _edges_of(front, 0, mask_front, e, s)
+    _edges_of(i, front, 0, mask_front, e, maps, s)
     if not _search(0, mask_front, ref[0], lp, s, line):
         return False
     lines[0] = line
-    _edges_of(side, 1, mask_side, e, s)
+    _edges_of(i, side, 1, mask_side, e, maps, s)
     if not _search(1, mask_side, ref[1], lp, s, line):
         return False
     lines[1] = line
@@ -706,16 +791,19 @@ def _perceive(
     ref: Array,
     g: ViewGeometry,
     e: EdgeTables,
+    maps: _Maps,
     lp: Array,
-    par: Array,
+    par: _Par,
     state: _State,
     s: _Scratch,
     point: Array,
     direction: Array,
     valid: Bools,
+    first: int,
+    last: int,
 ) -> None:
     p, d = np.empty(3), np.empty(3)
-    for i in range(len(front)):
+    for i in range(first, last):
         if not rows[i]:
             continue
         tip = tips[i]
@@ -723,10 +811,10 @@ def _perceive(
         known = False
         if state.tracking[i]:
             known = _track(
-                i, front[i], side[i], mask_front, mask_side, tip, ref, g, e, lp, par, state, s, p, d
+                i, front[i], side[i], mask_front, mask_side, tip, ref, g, e, maps, lp, par, state, s, p, d
             )
         if not known:
-            known = _start(i, front[i], side[i], mask_front, mask_side, ref, g, e, lp, state, s, p, d)
+            known = _start(i, front[i], side[i], mask_front, mask_side, ref, g, e, maps, lp, state, s, p, d)
         if not known:
             valid[i, 0] = valid[i, 1] = False
             continue
@@ -748,6 +836,10 @@ class Perception:
         nozzle: The nozzle's coverage of each pixel, front and side, shape (height, width).
         frame_s: Duration of a frame [s].
         cfg: Parameters.
+        plate: Normal of the plate in the tip frame of a gun held as taught, shape (3,); by default a nozzle
+            that halves the right angle between the plate and a wall on the left.
+        detector: Finds the edges in place of the fractional-order stage.
+        threads: Splits the batch; the lines are the same for any number.
     """
 
     def __init__(
@@ -757,6 +849,10 @@ class Perception:
         nozzle: tuple[Array, Array],
         frame_s: float,
         cfg: PerceptionCfg | None = None,
+        *,
+        plate: Array | None = None,
+        detector: EdgeDetector | None = None,
+        threads: int = 1,
     ) -> None:
         cfg = cfg or PerceptionCfg()
         length, width = int(views.size[0, 1]), int(views.size[0, 0])
@@ -764,32 +860,14 @@ class Perception:
             (length, width) == (int(views.size[1, 0]), int(views.size[1, 1])),
             f"ROIs of {views.size.tolist()} px: the side view's has to be the front view's on its side",
         )
+        self._n, self._threads, self._detector = n, threads, detector
         self._views = ViewGeometry(*(np.ascontiguousarray(x, np.float64) for x in views))
         self._masks = dilated(nozzle)
         ref = views.reference
         self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
         self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.table
-        memory = max(round(cfg.memory_s / frame_s), 1)
-        self._par = np.array(
-            [
-                memory,
-                cfg.ahead_px,
-                cfg.sigma_m,
-                cfg.bend,
-                cfg.clip_m,
-                cfg.jump_m,
-                cfg.row_sigma_m,
-                cfg.side_px,
-                cfg.height_q_m,
-                cfg.pitch_q_rad,
-                cfg.gate,
-                cfg.coast_s / frame_s + 1e-9,
-                cfg.follow_gain,
-                cfg.velocity_gain,
-            ],
-            dtype=np.float64,
-        )
-        rays = (memory + 1) * (int(cfg.ahead_px) + 1)
+        self._par = _Par.of(cfg, frame_s, _FILLET_PLATE if plate is None else plate)
+        rays = (int(self._par.memory) + 1) * (int(cfg.ahead_px) + 1)
         self._state = _State(
             point=np.zeros((n, 3)),
             direction=np.zeros((n, 3)),
@@ -804,23 +882,8 @@ class Perception:
             stamp=np.full((n, rays), -1, np.int64),
             head=np.zeros(n, np.int64),
         )
-        shape, pad = (length, width), self._edges.pad
-        self._scratch = _Scratch(
-            grey=np.empty(shape, np.int64),
-            padded=np.empty((length + 2 * pad, width + 2 * pad)),
-            work=np.empty(shape),
-            bins=np.empty(512, np.int64),
-            ex=np.empty(shape),
-            ey=np.empty(shape),
-            magnitude=np.empty(shape),
-            orientation=np.empty(shape),
-            intensity=np.empty(shape),
-            edge=np.empty(shape, np.bool_),
-            profile=np.empty(64),
-            points=np.empty((2 * length, 3)),
-            columns=np.empty((3, 2 * length)),
-            fit=np.empty((4, rays)),
-        )
+        # One work space for each thread that ever drew on it.
+        self._rooms = [_Scratch.of(length, width, self._edges.pad, rays)]
         self._lines = SeamLines(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2), np.bool_))
 
     def reset(self, i: int) -> None:
@@ -850,20 +913,49 @@ class Perception:
             The seam's lines; arrays of the caller's own. A view that has not shown the seam for the
             coasting time is invalid.
         """
-        _perceive(
-            np.ascontiguousarray(front),
-            np.ascontiguousarray(side),
-            *self._masks,
-            np.ascontiguousarray(tip_pose, dtype=np.float64),
-            np.ones(len(front), np.bool_) if rows is None else np.ascontiguousarray(rows, np.bool_),
-            self._reference,
-            self._views,
-            self._edges,
-            self._line,
-            self._par,
-            self._state,
-            self._scratch,
-            *self._lines,
-        )
+        images = np.ascontiguousarray(front), np.ascontiguousarray(side)
+        tips = np.ascontiguousarray(tip_pose, dtype=np.float64)
+        fresh = np.ones(self._n, np.bool_) if rows is None else np.ascontiguousarray(rows, np.bool_)
+        maps = self._detected(*images)
+
+        def look(first: int, last: int) -> None:
+            room = self._take_room()
+            _perceive(
+                *images,
+                *self._masks,
+                tips,
+                fresh,
+                self._reference,
+                self._views,
+                self._edges,
+                maps,
+                self._line,
+                self._par,
+                self._state,
+                room,
+                *self._lines,
+                first,
+                last,
+            )
+            self._rooms.append(room)
+
+        split(look, self._n, self._threads)
         point, direction, valid = self._lines
         return SeamLines(point.copy(), direction.copy(), valid.copy())
+
+    def _detected(self, front: Bytes, side: Bytes) -> _Maps:
+        if self._detector is None:
+            return _OWN
+        found = [self._detector(s, m) for s, m in zip(strips(front, side), self._masks, strict=True)]
+        return _Maps(
+            edge=(found[0].edge, found[1].edge),
+            intensity=(found[0].intensity, found[1].intensity),
+            vector=(found[0].vector, found[1].vector),
+        )
+
+    def _take_room(self) -> _Scratch:
+        try:
+            return self._rooms.pop()  # atomic, unlike asking for the length first
+        except IndexError:
+            length, width = self._masks[0].shape
+            return _Scratch.of(length, width, self._edges.pad, self._state.stamp.shape[1])
