@@ -55,6 +55,7 @@ _LOWER = np.where(_IS_FLAG, 0.0, -_BOUND)
 FEATURES = len(_BOUND)
 _X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 _MAX_DRAWS = 1000
+_FLANK_PX = 2.0
 
 
 class StepResult(NamedTuple):
@@ -191,8 +192,11 @@ class SealCore:
         self.frames[i] = 0
 
     def _draw_hover(self, rng: np.random.Generator) -> Array:
-        """``T_part_tip`` of a start from which both ROIs see the seam, drawn until one does."""
-        task, seam = self.cfg.task, self._seam
+        """``T_part_tip`` of a start from which both ROIs see the seam, drawn until one does.
+
+        An edge in the outermost pixels shows one of its sides only: it is not seen.
+        """
+        task, seam, views = self.cfg.task, self._seam, self._views.inside(_FLANK_PX)
         for _ in range(_MAX_DRAWS):
             hover = rng.uniform(*task.hover_m)
             sideways = rng.uniform(-task.sideways_m, task.sideways_m)
@@ -200,7 +204,7 @@ class SealCore:
             turn = axis_angle(_Z, about_z) @ axis_angle(_X, about_x)
             pose = self._start @ transform(turn, np.array([sideways, 0.0, hover]))
             seen = seam.at(self.progress.locate(pose[:3, 3])[1])
-            if oracle_lines(seen.position[None], seen.tangent[None], pose[None], self._views).valid.all():
+            if oracle_lines(seen.position[None], seen.tangent[None], pose[None], views).valid.all():
                 return pose
         raise ConfigError(
             f"no start in {_MAX_DRAWS} draws has the seam in both ROIs: reduce hover_m = {task.hover_m}, "

@@ -130,6 +130,21 @@ class ViewGeometry(NamedTuple):
             stand_off=np.array([stand_off]),
         )
 
+    def inside(self, margin_px: float) -> "ViewGeometry":
+        """The same cameras with smaller ROIs; pixels count from the smaller ROI's corner.
+
+        Args:
+            margin_px: Taken off on every side [px].
+
+        Returns:
+            Their geometry.
+        """
+        return self._replace(
+            centre=self.centre - margin_px,
+            size=self.size - 2.0 * margin_px,
+            reference=self.reference - margin_px,
+        )
+
 
 @kernel
 def _lines_to_features(

@@ -44,7 +44,10 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _FILLET_PLATE = np.array([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
 _STRETCHES = 20  # of the memory around the tip, in which new and old edges are compared
+_HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _MIN_ROWS = 8  # with an edge, for a view to count as seen
+_FINE_PX, _COARSE_PX = 0.3, 1.5  # how sure an edge of the first line is
+_START_SLOPE = 0.07  # of the side view's line as the gun is put before the seam
 _HEIGHT_START, _PITCH_START = 0.2 * _MM, 0.03
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
 
@@ -61,6 +64,8 @@ class PerceptionCfg:
         ahead_px: How far ahead the front view's edge is remembered [px].
         sigma_m: Width of the fit around the tip [m].
         bend: Standard deviation of the curve's quadratic coefficient [1/m].
+        step_m: Standard deviation of the seam's place against the frame before [m].
+        step_rad: Of its heading [rad].
         clip_m: Residuals beyond this weigh less [m].
         jump_m: A new edge this far from the memory's curve makes it forget [m].
         row_sigma_m: Standard deviation of a row's edge at a step of one grey level [m].
@@ -79,6 +84,8 @@ class PerceptionCfg:
     ahead_px: float = 26.0
     sigma_m: float = 2.0 * _MM
     bend: float = 80.0
+    step_m: float = 0.3 * _MM
+    step_rad: float = 5.0 * _DEG
     clip_m: float = 0.15 * _MM
     jump_m: float = 0.8 * _MM
     row_sigma_m: float = 3.0 * _MM
@@ -91,7 +98,7 @@ class PerceptionCfg:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        for name in ("coast_s", "memory_s", "ahead_px", "sigma_m", "bend", "clip_m", "jump_m", "row_sigma_m",
+        for name in ("coast_s", "memory_s", "ahead_px", "sigma_m", "bend", "step_m", "step_rad", "clip_m", "jump_m", "row_sigma_m",
                      "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
                      "velocity_gain"):  # fmt: skip
             value = getattr(self, name)
@@ -105,6 +112,8 @@ class _Par(NamedTuple):
     ahead_px: float
     sigma_m: float
     bend: float
+    step_m: float
+    step_rad: float
     clip_m: float
     jump_m: float
     row_sigma_m: float
@@ -308,13 +317,42 @@ def _edges_of(i: int, image: Bytes, view: int, mask: Bools, e: EdgeTables, maps:
 
 
 @kernel
-def _search(view: int, mask: Bools, ref: Array, lp: Array, s: _Scratch, line: Array) -> bool:
-    """A line without knowing where to look."""
+def _search(view: int, mask: Bools, ref: Array, lp: Array, s: _Scratch, line: Array) -> float:
+    """A line (p, q) without knowing where to look; returns how sure a row's edge is [px], 0 without a line.
+
+    Where the seam only grazes the ROI, RANSAC's line has to do: the view widens as the gun comes closer.
+    """
     raw = np.empty(2)
     if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], lp, raw):
-        return False
+        return 0.0
     n = follow(s.grey, mask, s.edge, ref[0], raw[0], raw[1], lp[8], lp[8], lp, s.profile, s.points)
-    return bool(local_line(s.points, n, ref[0], ref[1], raw[0], lp, s.columns, line) > 0.0)
+    if local_line(s.points, n, ref[0], ref[1], raw[0], lp, s.columns, line) > 0.0:
+        return _FINE_PX
+    line[0], line[1] = raw[0], raw[1]
+    return _COARSE_PX
+
+
+@kernel
+def _support(mask: Bools, t_ref: float, line: Array, lp: Array, s: _Scratch, out: Array) -> None:
+    """Rows with an edge on the line: mean t, count, sum of squares about the mean, mean step in grey levels."""
+    height, width = s.edge.shape
+    n = s1 = s2 = step = 0.0
+    for row in range(height):
+        t = row + 0.5 - t_ref
+        o = line[0] + line[1] * t
+        for x in range(max(int(o - lp[2]), 0), min(int(o + lp[2]) + 1, width)):
+            if s.edge[row, x] and not mask[row, x]:
+                n += 1.0
+                s1 += t
+                s2 += t * t
+                step += (
+                    s.grey[row, min(int(o) + 2, width - 1)] - s.grey[row, min(max(int(o) - 2, 0), width - 1)]
+                )
+                break
+    out[0] = s1 / max(n, 1.0)
+    out[1] = n
+    out[2] = s2 - s1 * out[0]
+    out[3] = lp[0] * step / (3.0 * max(n, 1.0))
 
 
 @kernel
@@ -447,7 +485,12 @@ def _fit_memory(
 ) -> bool:
     """Fits what is remembered near the tip in the plate's plane, and learns how the part moves across."""
     sigma, clip = par.sigma_m, par.clip_m
-    prior = 1.0 / (par.bend * sigma * sigma) ** 2
+    # The tangent moves little in a frame, which matters where the edges seen lie off the tip.
+    prior = (
+        1.0 / par.step_m**2,
+        1.0 / (par.step_rad * sigma) ** 2,
+        1.0 / (par.bend * sigma * sigma) ** 2,
+    )
     count = _gather(i, tip, p, d, n, m, sigma, oldest, state, fit)
     if count < _MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
@@ -596,11 +639,18 @@ def _side_residual(
     scale: float,
     out: Array,
 ) -> bool:
-    """Offset, slope and their variances at a step of 1 (out) of the side view's edge against the curve."""
+    """The side view's edge against the curve: offset and slope, their variances at a step of 1, the pivot's t.
+
+    The offset is measured at the pivot, the rows' mean, where it does not depend on the slope.
+    """
     b, x, found = np.empty(2), np.empty(3), np.empty(2)
     count = 0
     s0 = s1 = s2 = b0 = b1 = 0.0
-    for row in range(int(line[0] - par.side_px), int(line[0] + par.side_px) + 1):
+    # Above the plate the seam may come into the ROI only ahead of the tip.
+    below = line[1] - (mask.shape[1] - _HIDDEN)
+    skip = min(-below / line[2], float(mask.shape[0])) if below > 0.0 and line[2] < -1e-3 else 0.0
+    first = int(line[0] + skip - par.side_px)
+    for row in range(first, int(line[0] + skip + par.side_px) + 1):
         t = row + 0.5 - line[0]
         y = t / scale
         for _ in range(2):
@@ -617,7 +667,7 @@ def _side_residual(
             continue
         error = found[0] - b[1]
         # Far rows hang on the curve's bend, which is less sure.
-        w = found[1] * found[1] / (1.0 + (2.0 * t / par.side_px) ** 4)
+        w = found[1] * found[1] / (1.0 + (2.0 * (t - skip) / par.side_px) ** 4)
         s0 += w
         s1 += w * t
         s2 += w * t * t
@@ -627,8 +677,8 @@ def _side_residual(
     det = s0 * s2 - s1 * s1
     if count < _MIN_ROWS or det <= 1e-6 * s0 * s2:
         return False
-    out[0], out[1] = (b0 * s2 - b1 * s1) / det, (b1 * s0 - b0 * s1) / det
-    out[2], out[3] = s2 / det, s0 / det
+    out[0], out[1] = b0 / s0, (b1 * s0 - b0 * s1) / det
+    out[2], out[3], out[4] = 1.0 / s0, s0 / det, s1 / s0
     return True
 
 
@@ -659,7 +709,7 @@ def _track_side(
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    per_m, out = np.empty(2), np.empty(4)
+    per_m, out = np.empty(2), np.empty(5)
     _plate(d, par, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
@@ -674,6 +724,7 @@ def _track_side(
     if height == 0.0:
         return False
     pitch = _kalman(variance, 1, par.pitch_q_rad, out[1] / per_m[1] * per_m[0], r_pitch, par.gate)
+    height -= pitch * out[4] / per_m[0]
     for k in range(3):
         p[k] += height * lift[k]
         d[k] += pitch * lift[k]
@@ -763,20 +814,29 @@ def _start(
 ) -> bool:
     """Looks for a seam that is not tracked; False if the views show none."""
     _forget(i, state)
-    line, lines = np.empty(3), np.empty((2, 3))
+    line, lines, support = np.empty(3), np.empty((2, 3)), np.empty(4)
     _edges_of(i, front, 0, mask_front, e, maps, s)
-    if not _search(0, mask_front, ref[0], lp, s, line):
+    if _search(0, mask_front, ref[0], lp, s, line) <= 0.0:
         return False
     lines[0] = line
     _edges_of(i, side, 1, mask_side, e, maps, s)
-    if not _search(1, mask_side, ref[1], lp, s, line):
+    sigma = _search(1, mask_side, ref[1], lp, s, line)
+    if sigma <= 0.0:
         return False
-    lines[1] = line
+    _support(mask_side, ref[1, 0], line, lp, s, support)
+    if support[1] < lp[6] or support[3] < lp[5]:
+        return False
+    # A short line's slope says little: the gun is known to start nearly as taught.
+    q_noise = 3.0 * sigma * sigma / support[2]
+    share = _START_SLOPE**2 / (_START_SLOPE**2 + q_noise)
+    lines[1, 1] = share * line[1]
+    lines[1, 0] = line[0] + (line[1] - lines[1, 1]) * support[0]
     if not _triangulate(lines, ref, g, p, d):
         return False
     _nearest(p, d)
     state.tracking[i] = True
-    state.variance[i, 0], state.variance[i, 1] = _HEIGHT_START**2, _PITCH_START**2
+    state.variance[i, 0] = (_HEIGHT_START * sigma / _FINE_PX) ** 2
+    state.variance[i, 1] = _PITCH_START**2
     return True
 
 

@@ -338,7 +338,9 @@ def follow(
 
 
 @kernel
-def fit_curve(y: Array, x: Array, w: Array, n: int, prior: float, clip: float, out: Array) -> float:
+def fit_curve(
+    y: Array, x: Array, w: Array, n: int, prior: tuple[float, float, float], clip: float, out: Array
+) -> float:
     """Weighted least squares of x = out[0] + out[1] y + out[2] y^2, outliers weighed down.
 
     Args:
@@ -346,7 +348,7 @@ def fit_curve(y: Array, x: Array, w: Array, n: int, prior: float, clip: float, o
         x: Ordinates.
         w: Weights, inverse variances.
         n: How many.
-        prior: Inverse variance of out[2] about 0.
+        prior: Inverse variances of out about 0.
         clip: Residuals beyond this weigh less.
         out: The coefficients.
 
@@ -372,14 +374,15 @@ def fit_curve(y: Array, x: Array, w: Array, n: int, prior: float, clip: float, o
             b0 += weight * x[k]
             b1 += u * x[k]
             b2 += uu * x[k]
-        s4 += prior
         total = s0
+        s0 += prior[0]
+        s4 += prior[2]
         # Cholesky's factors of the three normal equations.
-        if s0 <= 0.0:
+        if total <= 0.0:
             return 0.0
         l0 = np.sqrt(s0)
         l1, l2 = s1 / l0, s2 / l0
-        d1 = s2 - l1 * l1
+        d1 = s2 + prior[1] - l1 * l1
         if d1 <= 1e-12 * s2:
             return 0.0
         m1 = np.sqrt(d1)
@@ -495,7 +498,7 @@ def local_line(
         work[2, k] = 1.0 / (1.0 + 2.0 * u * u)
         step += points[k, 2]
     curve = np.zeros(3)
-    if fit_curve(work[0], work[1], work[2], n, 0.01, 1.0, curve) <= 0.0:
+    if fit_curve(work[0], work[1], work[2], n, (0.0, 0.0, 0.01), 1.0, curve) <= 0.0:
         return 0.0
     c0, c1, c2 = p + curve[0] - o_ref, curve[1] / window, curve[2] / (window * window)
     s = 0.0

@@ -30,7 +30,7 @@ def _tip_in_part(core):
 
 
 def _episode(env_id, seed):
-    env, expert = gym.make(env_id, control="rmp"), RmpExpert()
+    env, expert = gym.make(env_id, control="rmp", perception="oracle"), RmpExpert()
     core = env.unwrapped.core
     observation, info = env.reset(seed=seed)
     out = types.SimpleNamespace(
@@ -54,7 +54,7 @@ def _episode(env_id, seed):
 
 @pytest.fixture(scope="session", params=seal_gym.ENV_IDS)
 def episode(request):
-    """The expert's whole episode on an id, recorded."""
+    """The expert's whole episode on an id, on the oracle's features, recorded."""
     out = _episode(request.param, 500_000)
     out.env_id = request.param
     return out

@@ -49,3 +49,9 @@ def test_the_expert_seals_by_vision(part):
     env.close()
     assert info["episode_metrics"]["outcome"] == "reached"
     assert info["episode_metrics"]["rmse_mm"] < 0.15
+
+
+def test_the_oracle_without_images_measures_no_noise():
+    env = gym.make("SealGym/Flat-v0", perception="oracle")
+    assert "snr_db" not in env.reset(seed=0)[1]
+    env.close()

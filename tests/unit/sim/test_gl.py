@@ -139,6 +139,7 @@ def test_the_environment_takes_either_renderer():
     for renderer in ("raycast", "gl"):
         env = gym.make(
             "SealGym/Rectangular-v0",
+            perception="oracle",
             observation="features+images",
             renderer=renderer,
             look=LookCfg.clean(),

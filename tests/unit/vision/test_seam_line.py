@@ -11,6 +11,7 @@ HEIGHT, WIDTH = 100, 50
 REFERENCE = np.array([25.4, 25.0])
 EDGES = EdgeTables.of(EdgeCfg())
 NO_MASK = np.zeros((HEIGHT, WIDTH), np.bool_)
+FREE = (0.0, 0.0, 0.0)
 
 
 def draw(o, dark=70.0, bright=110.0, sigma=8.0, seed=0, oversample=8):
@@ -115,16 +116,20 @@ def test_the_curve_is_least_squares_and_robust():
     rng = np.random.default_rng(2)
     y, w, out = rng.uniform(-1, 1, 40), rng.uniform(0.5, 2, 40), np.zeros(3)
     x = 0.3 - 0.2 * y + 0.7 * y**2 + rng.normal(0, 0.01, 40)
-    fit_curve(y, x, w, 40, 0.0, 1e9, out)
+    fit_curve(y, x, w, 40, FREE, 1e9, out)
     basis = np.column_stack((np.ones(40), y, y**2)) * np.sqrt(w)[:, None]
     np.testing.assert_allclose(out, np.linalg.lstsq(basis, x * np.sqrt(w), rcond=None)[0], atol=1e-10)
+    held = np.zeros(3)
+    fit_curve(y, x, w, 40, (3.0, 50.0, 7.0), 1e9, held)
+    normal = basis.T @ basis + np.diag([3.0, 50.0, 7.0])
+    np.testing.assert_allclose(held, np.linalg.solve(normal, basis.T @ (x * np.sqrt(w))), atol=1e-10)
     x[3] += 50.0
-    fit_curve(y, x, w, 40, 0.0, 0.05, out)
+    fit_curve(y, x, w, 40, FREE, 0.05, out)
     plain = np.zeros(3)
-    fit_curve(y, x, w, 40, 0.0, 1e9, plain)
+    fit_curve(y, x, w, 40, FREE, 1e9, plain)
     assert np.abs(out - [0.3, -0.2, 0.7]).max() < 0.1 * np.abs(plain - [0.3, -0.2, 0.7]).max()
-    assert fit_curve(np.ones(40), x, w, 40, 0.0, 1.0, out) == 0.0
-    assert fit_curve(y, x, np.zeros(40), 40, 0.0, 1.0, out) == 0.0
+    assert fit_curve(np.ones(40), x, w, 40, FREE, 1.0, out) == 0.0
+    assert fit_curve(y, x, np.zeros(40), 40, FREE, 1.0, out) == 0.0
 
 
 @pytest.mark.parametrize(
