@@ -62,11 +62,16 @@ class RmpExpert:
         return (action if features.ndim == 2 else action[0]), state
 
     def _act(self, o: Array) -> Array:
-        errors = SeamErrors(_MM * o[:, 0], _DEG * o[:, 1], _MM * o[:, 3], _DEG * o[:, 4], _DEG * o[:, 10])
+        # The features of a lost view are old: following them would drive the gun on.
+        seen = np.where(o[:, 2] * o[:, 5] > 0.5, 1.0, 0.0)
+        distance, angle = _MM * seen, _DEG * seen
+        errors = SeamErrors(
+            distance * o[:, 0], angle * o[:, 1], distance * o[:, 3], angle * o[:, 4], _DEG * o[:, 10]
+        )
         twist = np.concatenate((_MM * o[:, 11:14], _DEG * o[:, 14:17]), axis=1)
         seam = np.zeros_like(twist)
         seam[:, [0, 2]], seam[:, [3, 5]] = _MM * o[:, 6:8], _DEG * o[:, 8:10]
-        speed = np.where(o[:, 2] * o[:, 5] > 0.5, self._cell.process.speed_m_s, 0.0)
+        speed = seen * self._cell.process.speed_m_s
         policy = blend(seam_policies(errors, twist, reference_twist(speed, seam), self._sealing))
         action = np.concatenate(
             (policy.accel / self._scale, metric_to_cholesky(policy.metric) / CHOLESKY_SCALE), axis=1

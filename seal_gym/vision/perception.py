@@ -44,6 +44,8 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _FILLET_PLATE = np.array([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
 _STRETCHES = 20  # of the memory around the tip, in which new and old edges are compared
+_SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
+_BESIDE = 8  # pixels on either side of the line whose brightness is watched
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _MIN_ROWS = 8  # with an edge, for a view to count as seen
 _FINE_PX, _COARSE_PX = 0.3, 1.5  # how sure an edge of the first line is
@@ -60,6 +62,10 @@ class PerceptionCfg:
         edges: The edge stage.
         line: The line stage.
         coast_s: A lost view is believed for this long [s].
+        search_s: After this long the seam is looked for anew [s].
+        level_change: A view whose grey levels beside the line are this far from the usual is not believed.
+        level_step: Nor is one where they change by more from one frame to the next.
+        level_gain: Share of a frame in the usual levels.
         memory_s: Age at which a remembered edge is dropped [s].
         ahead_px: How far ahead the front view's edge is remembered [px].
         sigma_m: Width of the fit around the tip [m].
@@ -67,7 +73,7 @@ class PerceptionCfg:
         step_m: Standard deviation of the seam's place against the frame before [m].
         step_rad: Of its heading [rad].
         clip_m: Residuals beyond this weigh less [m].
-        jump_m: A new edge this far from the memory's curve makes it forget [m].
+        jump_m: New edges this far beside the memory's are not the seam's [m].
         row_sigma_m: Standard deviation of a row's edge at a step of one grey level [m].
         side_px: How far ahead and behind the side view is looked at [px].
         height_q_m: Drift of the plane's height from frame to frame [m].
@@ -80,6 +86,10 @@ class PerceptionCfg:
     edges: EdgeCfg = field(default_factory=EdgeCfg)
     line: LineCfg = field(default_factory=LineCfg)
     coast_s: float = 0.3
+    search_s: float = 1.0
+    level_change: float = 25.0
+    level_step: float = 6.0
+    level_gain: float = 0.15
     memory_s: float = 0.7
     ahead_px: float = 26.0
     sigma_m: float = 2.0 * _MM
@@ -87,7 +97,7 @@ class PerceptionCfg:
     step_m: float = 0.3 * _MM
     step_rad: float = 5.0 * _DEG
     clip_m: float = 0.15 * _MM
-    jump_m: float = 0.8 * _MM
+    jump_m: float = 0.4 * _MM
     row_sigma_m: float = 3.0 * _MM
     side_px: float = 18.0
     height_q_m: float = 0.01 * _MM
@@ -98,8 +108,9 @@ class PerceptionCfg:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        for name in ("coast_s", "memory_s", "ahead_px", "sigma_m", "bend", "step_m", "step_rad", "clip_m", "jump_m", "row_sigma_m",
-                     "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
+        for name in ("coast_s", "search_s", "level_change", "level_step", "level_gain",
+                     "memory_s", "ahead_px", "sigma_m", "bend", "step_m", "step_rad", "clip_m",
+                     "jump_m", "row_sigma_m", "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
                      "velocity_gain"):  # fmt: skip
             value = getattr(self, name)
             require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
@@ -122,6 +133,10 @@ class _Par(NamedTuple):
     pitch_q_rad: float
     gate: float
     coast: float
+    search: float
+    level_change: float
+    level_step: float
+    level_gain: float
     follow_gain: float
     velocity_gain: float
     plate_x: float
@@ -136,6 +151,7 @@ class _Par(NamedTuple):
             **same,
             memory=float(max(round(cfg.memory_s / frame_s), 1)),
             coast=cfg.coast_s / frame_s + 1e-9,
+            search=cfg.search_s / frame_s + 1e-9,
             plate_x=x,
             plate_y=y,
             plate_z=z,
@@ -150,7 +166,10 @@ class _State(NamedTuple):
     variance: Array  # of the plane's height and pitch, (N, 2)
     tracking: Bools  # (N,)
     missed: NDArray[np.int64]  # frames without the seam, (N, 2)
-    clock: NDArray[np.int64]  # frames since the reset, (N,)
+    clock: NDArray[np.int64]  # frames in which the front view showed the seam, (N,)
+    level: Array  # usual grey levels beside the line, views by sides, -1 before the first, (N, 2, 2)
+    last: Array  # those of the frame before
+    steady: NDArray[np.int64]  # frames since they jumped, (N, 2)
     velocity: Array  # of the part across the seam, world, (N, 3), m a frame
     eye: Array  # remembered rays: optical centre, world, (N, K, 3), m
     ray: Array  # direction, (N, K, 3)
@@ -334,7 +353,7 @@ def _search(view: int, mask: Bools, ref: Array, lp: Array, s: _Scratch, line: Ar
 
 @kernel
 def _support(mask: Bools, t_ref: float, line: Array, lp: Array, s: _Scratch, out: Array) -> None:
-    """Rows with an edge on the line: mean t, count, sum of squares about the mean, mean step in grey levels."""
+    """Rows with an edge on the line: mean t, count, sum of squares about it, mean step in grey levels."""
     height, width = s.edge.shape
     n = s1 = s2 = step = 0.0
     for row in range(height):
@@ -496,21 +515,19 @@ def _fit_memory(
         return False
     off = _drift(fit, count, curve)
     if abs(off) > par.jump_m:
-        # Not the same seam, or a part that was shoved: only the new edges count.
+        # No part moves like this: something else passes before the camera.
+        for k in range(state.stamp.shape[1]):
+            if state.stamp[i, k] == state.clock[i]:
+                state.stamp[i, k] = -1
+        return False
+    for a in range(3):
+        across = tip[a, 0] * m[0] + tip[a, 1] * m[1] + tip[a, 2] * m[2]
+        state.velocity[i, a] += par.velocity_gain * off * across
         for k in range(state.stamp.shape[1]):
             if state.stamp[i, k] != state.clock[i]:
-                state.stamp[i, k] = -1
-        for k in range(count):
-            fit[2, k] *= fit[3, k]
-    else:
-        for a in range(3):
-            across = tip[a, 0] * m[0] + tip[a, 1] * m[1] + tip[a, 2] * m[2]
-            state.velocity[i, a] += par.velocity_gain * off * across
-            for k in range(state.stamp.shape[1]):
-                if state.stamp[i, k] != state.clock[i]:
-                    state.eye[i, k, a] += par.follow_gain * off * across
-        for k in range(count):
-            fit[1, k] += par.follow_gain * off * (1.0 - fit[3, k])
+                state.eye[i, k, a] += par.follow_gain * off * across
+    for k in range(count):
+        fit[1, k] += par.follow_gain * off * (1.0 - fit[3, k])
     if fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
     curve[1] /= sigma
@@ -539,6 +556,43 @@ def _remember(
 
 
 @kernel
+def _usual(i: int, view: int, mask: Bools, line: Array, par: _Par, state: _State, s: _Scratch) -> bool:
+    """Whether plate and wall beside the expected line are as bright as they usually are.
+
+    A hand or a shadow that comes in changes them from one frame to the next; the wall beyond a corner changes
+    them slowly. What stays for longer than the coasting time is the new usual.
+    """
+    height, width = s.grey.shape
+    usual = steady = True
+    fresh = np.empty(2)
+    for side in range(2):
+        total, count = 0.0, 0
+        for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
+            o = line[1] + line[2] * (row + 0.5 - line[0])
+            first = int(o) + 2 if side == 1 else int(o) - 1 - _BESIDE
+            for x in range(max(first, 0), min(first + _BESIDE, width)):
+                if not mask[row, x]:
+                    total += s.grey[row, x]
+                    count += 1
+        level, last = state.level[i, view, side], state.last[i, view, side]
+        fresh[side] = total / (3.0 * count) if count >= _BESIDE else last
+        if level >= 0.0:
+            usual = usual and abs(fresh[side] - level) <= par.level_change
+            steady = steady and abs(fresh[side] - last) <= par.level_step
+        else:
+            state.level[i, view, side] = fresh[side]
+    state.steady[i, view] = state.steady[i, view] + 1 if steady else 0
+    usual = usual and steady
+    settled = state.missed[i, view] > par.coast and state.steady[i, view] > _SETTLED
+    for side in range(2):
+        state.last[i, view, side] = fresh[side]
+        if usual or settled:
+            gain = par.level_gain if usual else 1.0
+            state.level[i, view, side] += gain * (fresh[side] - state.level[i, view, side])
+    return usual or settled
+
+
+@kernel
 def _track_front(
     i: int,
     tip: Array,
@@ -553,32 +607,29 @@ def _track_front(
     d: Array,
     curve: Array,
 ) -> bool:
-    """Steps 1 and 2: moves the tangent (tip frame) to where the front view has it."""
+    """Steps 1 and 2: moves the tangent (tip frame) to where front view and memory have it.
+
+    Returns whether the front view showed the seam; without, the memory carries on.
+    """
     line, n, m = np.empty(3), np.empty(3), np.empty(3)
-    if not _strip_slope(p, d, 0, g, line):
-        return False
-    q = line[2]
-    if abs(q) > 2.0:
-        return False
-    count = follow(
-        s.grey,
-        mask,
-        s.edge,
-        ref[0],
-        line[1] + q * (ref[0] - line[0]),
-        q,
-        par.ahead_px,
-        par.ahead_px,
-        lp,
-        s.profile,
-        s.points,
-    )
-    if count < _MIN_ROWS:
-        return False
-    _remember(i, tip, count, ref, g, par, state, s)
+    seen = _strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0 and _usual(i, 0, mask, line, par, state, s)
+    if seen:
+        o = line[1] + line[2] * (ref[0] - line[0])
+        count = follow(
+            s.grey, mask, s.edge, ref[0], o, line[2], par.ahead_px, par.ahead_px, lp, s.profile, s.points
+        )
+        seen = count >= _MIN_ROWS
+        if seen:
+            state.clock[i] += 1
+            _remember(i, tip, count, ref, g, par, state, s)
     _plate(d, par, n, m)
     oldest = max(state.clock[i] - int(par.memory), 0)
-    if not _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve):
+    fitted = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
+    if seen and not fitted:
+        seen = False
+        fitted = _fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
+    if not fitted:
+        curve[2] = 0.0
         return False
     # The curve's point nearest the tip, the origin: |p + y d + x(y) m| is least.
     pd = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
@@ -593,7 +644,7 @@ def _track_front(
         p[k] += y * d[k] + x * m[k]
         d[k] += slope * m[k]
     _normalise(d)
-    return True
+    return bool(seen)
 
 
 @kernel
@@ -639,7 +690,7 @@ def _side_residual(
     scale: float,
     out: Array,
 ) -> bool:
-    """The side view's edge against the curve: offset and slope, their variances at a step of 1, the pivot's t.
+    """The side view's edge against the curve: offset, slope, their variances at a step of 1, pivot (t).
 
     The offset is measured at the pivot, the rows' mean, where it does not depend on the slope.
     """
@@ -713,6 +764,8 @@ def _track_side(
     _plate(d, par, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
+    if not _usual(i, 1, mask, line, par, state, s):
+        return False
     if not _side_residual(mask, g, lp, par, s, p, d, m, bend, line, per_m[0], out):
         return False
     # Neighbouring rows share pixels: five times the variance of independent ones.
@@ -740,6 +793,9 @@ def _forget(i: int, state: _State) -> None:
         state.velocity[i, a] = 0.0
     for k in range(state.stamp.shape[1]):
         state.stamp[i, k] = -1
+    for v in range(2):
+        for k in range(2):
+            state.level[i, v, k] = -1.0
 
 
 @kernel
@@ -769,7 +825,10 @@ def _track(
     p: Array,
     d: Array,
 ) -> bool:
-    """Carries a track on by a frame; False when it is given up."""
+    """Carries a track on by a frame; False when both views have to be searched anew."""
+    if state.missed[i, 0] > par.coast:
+        for a in range(3):
+            state.velocity[i, a] = 0.0
     for a in range(3):
         state.point[i, a] += state.velocity[i, a]
         for k in range(state.stamp.shape[1]):
@@ -786,13 +845,12 @@ def _track(
         state.missed[i, 0] = 0
     else:
         state.missed[i, 0] += 1
-        curve[2] = 0.0
     _edges_of(i, side, 1, mask_side, e, maps, s)
     if _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2]):
         state.missed[i, 1] = 0
     else:
         state.missed[i, 1] += 1
-    return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par.coast)
+    return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par.search)
 
 
 @kernel
@@ -812,8 +870,7 @@ def _start(
     p: Array,
     d: Array,
 ) -> bool:
-    """Looks for a seam that is not tracked; False if the views show none."""
-    _forget(i, state)
+    """Looks for a seam that is not tracked; False if the views show none, and all stays as it was."""
     line, lines, support = np.empty(3), np.empty((2, 3)), np.empty(4)
     _edges_of(i, front, 0, mask_front, e, maps, s)
     if _search(0, mask_front, ref[0], lp, s, line) <= 0.0:
@@ -834,6 +891,7 @@ def _start(
     if not _triangulate(lines, ref, g, p, d):
         return False
     _nearest(p, d)
+    _forget(i, state)
     state.tracking[i] = True
     state.variance[i, 0] = (_HEIGHT_START * sigma / _FINE_PX) ** 2
     state.variance[i, 1] = _PITCH_START**2
@@ -862,20 +920,23 @@ def _perceive(
     first: int,
     last: int,
 ) -> None:
-    p, d = np.empty(3), np.empty(3)
+    p, d, fresh_p, fresh_d = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(first, last):
         if not rows[i]:
             continue
         tip = tips[i]
-        state.clock[i] += 1
-        known = False
+        found = False
         if state.tracking[i]:
-            known = _track(
+            found = _track(
                 i, front[i], side[i], mask_front, mask_side, tip, ref, g, e, maps, lp, par, state, s, p, d
             )
-        if not known:
-            known = _start(i, front[i], side[i], mask_front, mask_side, ref, g, e, maps, lp, state, s, p, d)
-        if not known:
+        if not found:
+            found = _start(
+                i, front[i], side[i], mask_front, mask_side, ref, g, e, maps, lp, state, s, fresh_p, fresh_d
+            )
+            if found:
+                p[:], d[:] = fresh_p, fresh_d
+        if not state.tracking[i]:
             valid[i, 0] = valid[i, 1] = False
             continue
         for a in range(3):
@@ -885,6 +946,7 @@ def _perceive(
                 state.direction[i, a] += tip[a, b] * d[b]
         for v in range(2):
             _emit(i, v, p, d, g, point, direction, valid)
+            valid[i, v] = valid[i, v] and state.missed[i, v] <= par.coast
 
 
 class Perception:
@@ -935,6 +997,9 @@ class Perception:
             tracking=np.zeros(n, np.bool_),
             missed=np.zeros((n, 2), np.int64),
             clock=np.zeros(n, np.int64),
+            level=np.full((n, 2, 2), -1.0),
+            last=np.zeros((n, 2, 2)),
+            steady=np.zeros((n, 2), np.int64),
             velocity=np.zeros((n, 3)),
             eye=np.zeros((n, rays, 3)),
             ray=np.zeros((n, rays, 3)),
@@ -955,6 +1020,7 @@ class Perception:
         for values in self._state:
             values[i] = 0
         self._state.stamp[i] = -1
+        self._state.level[i] = -1.0
         for values in self._lines:
             values[i] = 0
 
