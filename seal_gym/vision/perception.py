@@ -87,9 +87,9 @@ class PerceptionCfg:
     line: LineCfg = field(default_factory=LineCfg)
     coast_s: float = 0.3
     search_s: float = 1.0
-    level_change: float = 25.0
-    level_step: float = 6.0
-    level_gain: float = 0.15
+    level_change: float = 35.0
+    level_step: float = 9.0
+    level_gain: float = 0.2
     memory_s: float = 0.7
     ahead_px: float = 26.0
     sigma_m: float = 2.0 * _MM
@@ -97,7 +97,7 @@ class PerceptionCfg:
     step_m: float = 0.3 * _MM
     step_rad: float = 5.0 * _DEG
     clip_m: float = 0.15 * _MM
-    jump_m: float = 0.4 * _MM
+    jump_m: float = 0.8 * _MM
     row_sigma_m: float = 3.0 * _MM
     side_px: float = 18.0
     height_q_m: float = 0.01 * _MM
@@ -515,9 +515,10 @@ def _fit_memory(
         return False
     off = _drift(fit, count, curve)
     if abs(off) > par.jump_m:
-        # No part moves like this: something else passes before the camera.
+        # No part moves like this: something else passes the camera or, if it stays, the part was shoved.
+        shoved = state.missed[i, 0] > par.coast
         for k in range(state.stamp.shape[1]):
-            if state.stamp[i, k] == state.clock[i]:
+            if (state.stamp[i, k] == state.clock[i]) != shoved:
                 state.stamp[i, k] = -1
         return False
     for a in range(3):
@@ -579,17 +580,21 @@ def _usual(i: int, view: int, mask: Bools, line: Array, par: _Par, state: _State
         if level >= 0.0:
             usual = usual and abs(fresh[side] - level) <= par.level_change
             steady = steady and abs(fresh[side] - last) <= par.level_step
-        else:
-            state.level[i, view, side] = fresh[side]
     state.steady[i, view] = state.steady[i, view] + 1 if steady else 0
     usual = usual and steady
     settled = state.missed[i, view] > par.coast and state.steady[i, view] > _SETTLED
     for side in range(2):
         state.last[i, view, side] = fresh[side]
-        if usual or settled:
-            gain = par.level_gain if usual else 1.0
-            state.level[i, view, side] += gain * (fresh[side] - state.level[i, view, side])
     return usual or settled
+
+
+@kernel
+def _learn(i: int, view: int, par: _Par, state: _State) -> None:
+    """Takes the grey levels of a frame that showed the seam into the usual ones."""
+    for side in range(2):
+        change = state.last[i, view, side] - state.level[i, view, side]
+        known = state.level[i, view, side] >= 0.0 and abs(change) <= par.level_change
+        state.level[i, view, side] += (par.level_gain if known else 1.0) * change
 
 
 @kernel
@@ -843,11 +848,13 @@ def _track(
     _edges_of(i, front, 0, mask_front, e, maps, s)
     if _track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve):
         state.missed[i, 0] = 0
+        _learn(i, 0, par, state)
     else:
         state.missed[i, 0] += 1
     _edges_of(i, side, 1, mask_side, e, maps, s)
     if _track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2]):
         state.missed[i, 1] = 0
+        _learn(i, 1, par, state)
     else:
         state.missed[i, 1] += 1
     return bool(max(state.missed[i, 0], state.missed[i, 1]) <= par.search)
