@@ -11,7 +11,6 @@ Writes table2.json, .csv, .md and .png, and a file with every frame of each tria
 
 import argparse
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from seal_gym.core.errors import SealGymError
 from seal_gym.core.frames import Array
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.estimation.line_kalman import LineKalman, LineKalmanCfg
-from seal_gym.vision.edges import EdgeCfg, EdgeTables
+from seal_gym.vision.baselines import DETECTORS
 from seal_gym.vision.endpoints import end_points, image_lines, strip_references
 from seal_gym.vision.features import MIN_SEEN_PX, RoiFeatures, SeamLines, ViewGeometry, update_features
 from seal_gym.vision.perception import Perception
@@ -41,10 +40,8 @@ CORNER_M = 15e-3  # arc this near a corner belongs to it
 SETTLED_M = 10e-3  # the approach from the hover is not measured
 WARM_UP_M = 10e-3
 _END_M = 2e-3
-# By edge method, what ``find_lines`` takes.
-EDGES: dict[str, Callable[[], EdgeTables]] = {"fractional": lambda: EdgeTables.of(EdgeCfg())}
 # Edge methods that the tracker with a memory is run on.
-MEMORY = ("fractional",)
+MEMORY = ("ours",)
 # Chosen on validation seeds, as the default for unrefined lines was.
 KALMAN = {"raw": LineKalmanCfg(), "refined": LineKalmanCfg(q=8.0)}
 
@@ -77,7 +74,7 @@ class Ride(trials.Trial):
 
 METHODS = [
     Method(edge, tracker, refined)
-    for edge in EDGES
+    for edge in DETECTORS
     for tracker, refined in (
         ("none", False),
         ("kalman", False),
@@ -226,14 +223,13 @@ def lines_by_frame(film: Film, edge: str) -> dict[str, tuple[Array, Bools]]:
     """
     masks, references = dilated(film.nozzle), strip_references(_views())
     found = [
-        find_lines(images, mask, reference, EDGES[edge]())
+        find_lines(images, mask, reference, DETECTORS[edge]())
         for images, mask, reference in zip(strips(film.front, film.side), masks, references, strict=True)
     ]
     raw = np.stack([f.raw for f in found], axis=1)
     refined = np.stack([f.line[:, :2] for f in found], axis=1)
-    # RANSAC without a line leaves zeros.
     return {
-        "raw": (raw, np.asarray(raw.any(axis=-1))),
+        "raw": (raw, np.isfinite(raw[..., 0])),
         "refined": (refined, np.stack([f.valid for f in found], axis=1)),
     }
 

@@ -30,7 +30,7 @@ def rmse_by_hand(files, method, view, feature, near_corner):
         for s, found, truth in zip(
             file["s_m"], file[method][:, view, feature], file["truth"][:, view, feature], strict=True
         ):
-            # Sides of 110 and 144.3 mm, each followed by a corner of 5 mm radius; 15 mm before and behind count.
+            # Sides of 110 and 144.3 mm, each followed by a corner of 5 mm radius and 15 mm around it.
             arc = 0.005 * np.pi / 2
             arcs = [(0.110, 0.110 + arc), (0.2543 + arc, 0.2543 + 2 * arc)]
             if any(a - 0.015 <= s <= b + 0.015 for a, b in arcs) == near_corner and np.isfinite(found):
@@ -62,8 +62,8 @@ def test_a_table_of_a_short_run(made):
 
 
 @pytest.mark.parametrize("region", ["straight", "corner"])
-@pytest.mark.parametrize(("method", "k"), [("fractional-raw-none", 0), ("fractional-refined-kalman", 1),
-                                            ("fractional-refined-memory", 2)])  # fmt: skip
+@pytest.mark.parametrize(("method", "k"), [("ours-raw-none", 0), ("ours-refined-kalman", 1),
+                                            ("ours-refined-memory", 2)])  # fmt: skip
 def test_a_figure_is_the_one_of_the_frames(made, method, k, region):
     out, document = made
     files = [frames_by_hand(out, seed) for seed in (500_012, 500_013)]
@@ -94,7 +94,9 @@ def test_the_tracker_is_near_the_truth_and_a_raw_line_less_so(made):
     best = {
         (r["tracker"], r["view"], r["feature"]): r["rmse"]
         for r in document["rows"]
-        if r["region"] == "all" and (r["tracker"], r["refined"]) in (("memory", True), ("none", False))
+        if r["region"] == "all"
+        and r["edge"] == "ours"
+        and (r["tracker"], r["refined"]) in (("memory", True), ("none", False))
     }
     for view in ("front", "side"):
         assert best["memory", view, "d_attr"] < 0.35
@@ -106,13 +108,13 @@ def test_a_killed_run_goes_on_and_two_processes_find_the_same(made, tmp_path):
     out, document = made
     log = (out / "table2.trials.jsonl").read_text().splitlines()
     marked = json.loads(log[0])
-    marked["sums"]["fractional-raw-none"]["straight"]["squared"][0][0] += 1e6
+    marked["sums"]["ours-raw-none"]["straight"]["squared"][0][0] += 1e6
     (tmp_path / "table2.trials.jsonl").write_text(json.dumps(marked) + "\n" + log[1][:50] + "\n")
     assert table2.main([*SHORT, "--jobs", "2", "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "table2.json").read_text())["rows"]
     changed = [a for a, b in zip(rows, document["rows"], strict=True) if a != b]
-    assert {(r["tracker"], r["refined"], r["view"], r["feature"]) for r in changed} == {
-        ("none", False, "front", "d_attr")
+    assert {(r["edge"], r["tracker"], r["refined"], r["view"], r["feature"]) for r in changed} == {
+        ("ours", "none", False, "front", "d_attr")
     }
     assert {r["region"] for r in changed} == {"all", "straight"}
     assert not (tmp_path / "frames" / f"rectangular-{marked['seed']}.npz").exists()  # it did not run again
@@ -123,7 +125,7 @@ def views_of(point, direction):
 
 
 def test_features_of_lines_by_hand():
-    """Lines through the stand-off's image moved by 3 px across, upright in the front view, level in the side."""
+    """Lines beside the stand-off's image, upright in the front view and level in the side view."""
     (x, y), (u, v) = ViewGeometry.of(load_cell()).reference
     straight = table2.features_of(views_of([[[x + 3, 0], [0, v - 2]]], [[[0, 1], [1, 0]]]))
     np.testing.assert_allclose(straight[0, :, :2], [[3, 0], [-2, 0]], atol=1e-9)
@@ -170,9 +172,10 @@ def test_rmse_of_all_frames_and_its_interval():
 def test_an_interval_is_near_the_normal_one():
     squared, lines = np.random.default_rng(0).uniform(0.5, 1.5, 400) * 300, np.full(400, 300)
     low, high = table2_report.rmse_interval(squared, lines)
-    # Standard error of the mean square, halved by the root's slope at 1.
-    half = 1.96 * np.sqrt(1 / 12 / 400) / 2
-    assert low == pytest.approx(1 - half, abs=0.004) and high == pytest.approx(1 + half, abs=0.004)
+    # Standard error of the mean square, over twice the root.
+    rmse = np.sqrt(squared.sum() / lines.sum())
+    half = 1.96 * np.std(squared / 300) / np.sqrt(400) / (2 * rmse)
+    assert low == pytest.approx(rmse - half, abs=0.001) and high == pytest.approx(rmse + half, abs=0.001)
     assert table2_report.rmse_interval(squared[:1], lines[:1]) is None
 
 

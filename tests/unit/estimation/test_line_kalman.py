@@ -1,4 +1,4 @@
-"""The line filter against hand-written matrices, closed forms of its steady state, its rules for lost lines."""
+"""The line filter against hand-written matrices and closed forms, and its rules for lost lines."""
 
 import numpy as np
 import pytest
