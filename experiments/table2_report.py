@@ -140,27 +140,33 @@ def _figure(row: dict[str, Any]) -> str:
     return f"{row['rmse']:.2f} [{row['rmse_ci'][0]:.2f}, {row['rmse_ci'][1]:.2f}]"
 
 
-def _columns(features: tuple[tuple[str, str], ...]) -> list[tuple[str, str, str]]:
-    return [(view, feature, unit) for view in VIEWS for feature, unit in features]
+_COLUMNS = [(view, feature, unit) for view in VIEWS for feature, unit in FEATURES[:2]]
+_TIP_COLUMNS = [(view, feature, unit) for view in VIEWS for feature, unit in FEATURES[2:]]
 
 
-def _paper(part: str, columns: list[tuple[str, str, str]]) -> list[list[str]]:
-    if (part, *columns[0][:2]) not in PAPER:
-        return []
+def _paper(part: str) -> list[list[str]]:
     return [
         [
             "*Zhou et al., units unstated*",
             "",
             tracker,
-            *(f"{PAPER[part, c[0], c[1]][k]:.2f}" for c in columns),
-            "",
+            *(f"{PAPER[part, view, feature][k]:.2f}" for view, feature, _ in _COLUMNS),
+            *[""] * (1 + len(_TIP_COLUMNS)),
         ]
         for k, tracker in enumerate(("none", "kalman"))
     ]
 
 
+def _line(cell: dict[tuple[str, str], dict[str, Any]]) -> list[str]:
+    """One method's figures: in the image with their intervals, in the tip frame without."""
+    image = [cell[view, feature] for view, feature, _ in _COLUMNS]
+    tip = [cell[view, feature] | {"rmse_ci": None} for view, feature, _ in _TIP_COLUMNS]
+    share = min(row["availability_pct"] for row in cell.values())
+    return [*_label(image[0]), *map(_figure, image + tip), f"{share:.1f}"]
+
+
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """The tables for people, one for each part, region and frame of reference.
+    """The tables for people, one for each part and region.
 
     Args:
         rows: From ``summarise``.
@@ -171,21 +177,20 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     blocks: dict[tuple[str, ...], dict[tuple[str, str], dict[str, Any]]] = {}
     for row in rows:
         blocks.setdefault(_key(row), {})[row["view"], row["feature"]] = row
+    names = [f"{view} {feature} [{unit}]" for view, feature, unit in _COLUMNS + _TIP_COLUMNS]
     text = []
     for part, region in dict.fromkeys(key[:2] for key in blocks):
-        for place, features in (("image", FEATURES[:2]), ("tip frame", FEATURES[2:])):
-            columns = _columns(features)
-            head = ["edge", "line", "tracker", *(f"{v} {f} [{u}]" for v, f, u in columns), "lines %"]
-            body = []
-            for key, cell in blocks.items():
-                if key[:2] == (part, region):
-                    chosen = [cell[v, f] for v, f, _ in columns]
-                    share = min(row["availability_pct"] for row in chosen)
-                    body.append([*_label(chosen[0]), *map(_figure, chosen), f"{share:.1f}"])
-            if region == "all":
-                body += _paper(part, columns)
-            text.append(f"### {part}, {region}: RMSE in the {place}\n\n{_grid([head, *body])}")
-    return "\n\n".join(text)
+        body = [_line(cell) for key, cell in blocks.items() if key[:2] == (part, region)]
+        if region == "all":
+            body += _paper(part)
+        grid = _grid([["edge", "line", "tracker", *names, "frames with a line %"], *body])
+        text.append(f"### {part}{'' if region == 'all' else f', {region}s'}\n\n{grid}")
+    note = (
+        "RMSE over the frames with a line, with 95 % intervals (bootstrap over trials): d_attr and theta in "
+        "the image, d_tip and theta_tip in the tip frame. The last column is the least share of frames with "
+        "a line, of either view and of both together."
+    )
+    return "\n\n".join([*text, note])
 
 
 def _grid(lines: list[list[str]]) -> str:
@@ -248,18 +253,17 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             place = cells.setdefault((row["workpiece"], row["region"]), {})
             place.setdefault((row["view"], row["feature"]), []).append(row)
     edges = list(dict.fromkeys(row["edge"] for row in rows))
-    kinds = [(v, f, u) for v, f, u in _columns(FEATURES[:2])]
     figure, grid = plt.subplots(
-        len(kinds),
+        len(_COLUMNS),
         len(cells),
-        figsize=(3.6 * len(cells) + 1.0, len(kinds) * (0.9 + 0.55 * len(edges)) + 1.0),
+        figsize=(3.6 * len(cells) + 1.0, len(_COLUMNS) * (0.9 + 0.55 * len(edges)) + 1.0),
         squeeze=False,
         sharex="row",
         sharey=True,
         constrained_layout=True,
     )
     for column, ((part, region), place) in zip(grid.T, cells.items(), strict=True):
-        for axes, (view, feature, unit) in zip(column, kinds, strict=True):
+        for axes, (view, feature, unit) in zip(column, _COLUMNS, strict=True):
             _panel(axes, place[view, feature], edges)
             name = {"d_attr": "attraction distance", "theta": "angle"}[feature]
             axes.set_xlabel(f"{view} view, {name}: RMSE [{unit}]", fontsize=8.5)
@@ -268,6 +272,9 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(
         unique.values(), unique.keys(), loc="outside lower center", ncols=4, fontsize=8.5, frameon=False
+    )
+    figure.suptitle(
+        "Error of the seam's line by edge method and tracker: RMSE, 95 % interval (left is better)"
     )
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -57,7 +57,7 @@ def test_a_table_of_a_short_run(made):
     with (out / "table2.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(rows)
     text = (out / "table2.md").read_text()
-    assert "3.69" in text and "### rectangular, corner: RMSE in the image" in text
+    assert "3.69" in text and "### rectangular, corners\n" in text
     assert (out / "table2.png").stat().st_size > 20_000
 
 
