@@ -144,16 +144,16 @@ def _blurred(grey: Single, mask: Mask, sigma_px: float) -> Single:
 
 def _gradient(grey: Single, mask: Mask) -> tuple[Single, Single]:
     """Sobel's differences, zero under the mask [4 grey levels a pixel]."""
-    gx, gy = (
-        np.asarray(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, borderType=cv2.BORDER_REPLICATE))
-        for dx in (1, 0)
-    )
-    gx[mask] = 0.0
-    gy[mask] = 0.0
+
+    def sobel(dx: int, dy: int) -> Single:
+        out = cv2.Sobel(grey, cv2.CV_32F, dx, dy, ksize=3, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.float32)
+
+    gx, gy = sobel(1, 0), sobel(0, 1)
     # Rounding of the blur must not make edges of flat ground.
-    noise = np.hypot(gx, gy) < 1e-2
-    gx[noise] = 0.0
-    gy[noise] = 0.0
+    none = mask | (np.hypot(gx, gy) < 1e-2)
+    gx[none] = 0.0
+    gy[none] = 0.0
     return gx, gy
 
 
