@@ -10,12 +10,14 @@ without memory: the tracker's figures are another table.
 import argparse
 import sys
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from tqdm import tqdm
 
 from experiments import edge_tables, photo_seams, tune_edges
@@ -46,11 +48,27 @@ from seal_gym.workpieces.catalogue import NAMES
 mpl.use("Agg")  # no screen needed
 import matplotlib.pyplot as plt  # the backend has to be chosen first
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 # Best at 2 dB by ``tune_edges``.
-IN_NOISE: dict[str, Row] = {}
+IN_NOISE: dict[str, Row] = {
+    "canny": {"sigma_px": 1.0, "share": 0.03, "ratio": 0.8},
+    "sobel": {"sigma_px": 0.0, "share": 0.16},
+    "sobel_blurred": {"sigma_px": 0.7, "share": 0.05},
+    "lsd": {
+        "sigma_px": 1.0,
+        "scale": 0.8,
+        "sigma_scale": 1.0,
+        "quant": 1.0,
+        "angle_deg": 30.0,
+        "density": 0.7,
+        "refine": "standard",
+        "min_length_px": 5.0,
+    },
+    "ours_tuned": {"weights": "a+b+c, more b", "alpha": 0.5, "length": 7, "tau": 0.55, "share": 0.05},
+}
 
 LEVELS_DB = tuple(range(20, -7, -2))
 LABELS = {
@@ -71,7 +89,7 @@ _COLOURS = {
     "ours_tuned": "#5e2ca5",
 }
 _MARKERS = {"canny": "s", "sobel": "v", "sobel_blurred": "^", "lsd": "D", "ours": "o", "ours_tuned": "P"}
-_EDGE, _TRUE, _RAW, _REFINED = (1.0, 0.55, 0.0), "#19c819", "#2ec8ff", "#ff1744"
+_EDGE, _TRUE, _RAW, _REFINED = (1.0, 0.55, 0.0), "#00b400", "#0028ff", "#e00000"
 _REFINED_PX = 30.0  # the local curve's reach on either side of the tip
 _COLUMNS = {
     "offset_px": "offset at the tip [px]",
@@ -152,11 +170,12 @@ def _draw_lines(
 ) -> None:
     """Draws the true line of a strip, RANSAC's and the refined one, as far as these were found."""
     refined = found.line[k, :2] if found.valid[k] else np.full(2, np.nan)
-    for line, reach, style in (
-        (truth, 1e3, {"color": _TRUE, "lw": 3.2, "alpha": 0.8}),
-        (found.raw[k], 1e3, {"color": _RAW, "lw": 1.5}),
-        (refined, _REFINED_PX, {"color": _REFINED, "lw": 1.5, "ls": "--"}),
-    ):
+    lines: tuple[tuple[Array, float, Row], ...] = (
+        (truth, 1e3, {"color": _TRUE, "lw": 2.2}),
+        (found.raw[k], 1e3, {"color": _RAW, "lw": 1.3}),
+        (refined, _REFINED_PX, {"color": _REFINED, "lw": 1.3, "ls": (0, (3, 2))}),
+    )
+    for line, reach, style in lines:
         t = np.array([max(reference[0] - reach, 0.0), min(reference[0] + reach, length)])
         axes.plot(*_to_image(t, line[0] + line[1] * (t - reference[0]), view, length), **style)
 
@@ -177,7 +196,7 @@ def _draw_method(axes: Axes, frames: SeamFrames, name: str, view: int) -> None:
     _draw_lines(axes, frames.truth[0, view], found, 0, reference, view, length)
     e = stage_errors(found, frames.truth[:, view], reference[1])
     text = "\n".join(f"{s}: {abs(e[s].offset_px[0]):.2f} px, {abs(e[s].angle_deg[0]):.1f}°" for s in STAGES)
-    axes.set_xlabel(text, fontsize=8)
+    axes.set_xlabel(text, fontsize=10)
 
 
 def panels(path: Path, seed: int, view: int) -> None:
@@ -189,17 +208,14 @@ def panels(path: Path, seed: int, view: int) -> None:
         view: 0 front, 1 side.
     """
     titles = ["camera image", "grey", *LABELS.values()]
-    size = (12.6, 12.2) if view == 0 else (17.5, 6.4)
-    figure, grid = plt.subplots(len(NAMES), len(titles), figsize=size, constrained_layout=True)
-    for row, part in zip(grid, NAMES, strict=True):
+    # A row a part, or a column where the images are wide.
+    size, shape = ((15.4, 13.4), (3, 8)) if view == 0 else ((14.2, 19.5), (8, 3))
+    figure, grid = plt.subplots(*shape, figsize=size, constrained_layout=True)
+    cells = grid if view == 0 else grid.T
+    for row, part in zip(cells, NAMES, strict=True):
         frames = panel_frame(part, seed)
         where = "at a corner" if frames.corner[0] else "away from corners"
-        snr = frames.images.snr_db[0, view]
-        row[0].set_ylabel(
-            f"{part}, {where}\nSNR {snr:.1f} dB, seed {frames.seed[0]}" if view == 0
-            else f"{part}, {where}\nSNR {snr:.1f} dB\nseed {frames.seed[0]}",
-            fontsize=9,
-        )  # fmt: skip
+        head = f"{part}, {where}\nSNR {frames.images.snr_db[0, view]:.1f} dB, seed {frames.seed[0]}"
         image = _as_image(frames.strip[view][0], view)
         extent = (0, image.shape[1], image.shape[0], 0)
         row[0].imshow(image, extent=extent, interpolation="nearest")
@@ -210,21 +226,39 @@ def panels(path: Path, seed: int, view: int) -> None:
             _draw_method(axes, frames, name, view)
         for axes in row:
             axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
-    for axes, title in zip(grid[0], titles, strict=True):
-        axes.set_title(title, fontsize=11)
+        if view == 0:
+            row[0].set_ylabel(head, fontsize=11)
+        else:
+            row[0].set_title(head, fontsize=12)
+    for axes, title in zip(cells[0], titles, strict=True):
+        if view == 0:
+            axes.set_title(title, fontsize=12)
+        else:
+            axes.set_ylabel(title, fontsize=12)
     handles = [
         Patch(color=_EDGE, label="edge pixels"),
         Patch(color=(0.35, 0.35, 0.4), label="nozzle's mask"),
-        Line2D([], [], color=_TRUE, lw=3.2, label="truth: the seam's tangent at the tip"),
+        Line2D([], [], color=_TRUE, lw=2.5, label="truth: the seam's tangent at the tip"),
         Line2D([], [], color=_RAW, lw=1.5, label="raw: RANSAC through the whole ROI"),
         Line2D([], [], color=_REFINED, lw=1.5, ls="--", label="refined: sub-pixel, near the tip"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9)
+    columns = 5 if view == 0 else 3
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=11)
     figure.suptitle(
-        f"{VIEWS[view].capitalize()} view: edges and lines of single frames, with their errors", fontsize=12
+        f"{VIEWS[view].capitalize()} view: edges and lines of single frames; the lines' errors at the tip",
+        fontsize=13,
     )
-    figure.savefig(path, dpi=80)
+    _save(figure, path, 90)
+
+
+def _save(figure: Figure, path: Path, dpi: int) -> None:
+    """Writes a figure in 256 colours: sensor noise in full colour makes files of a megabyte."""
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=dpi)
     plt.close(figure)
+    Image.open(buffer).convert("RGB").quantize(
+        256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    ).save(path, optimize=True)
 
 
 # -- accuracy against the signal-to-noise ratio -----------------------------------------------------------
@@ -325,8 +359,7 @@ def snr_chart(path: Path, rows: list[Row], usual_db: float, settings: str) -> No
         f"{FAIL_PX:g} px or {FAIL_DEG:g}° off.",
         fontsize=11,
     )
-    figure.savefig(path, dpi=85)
-    plt.close(figure)
+    _save(figure, path, 85)
 
 
 # -- photographs ------------------------------------------------------------------------------------------
@@ -392,8 +425,7 @@ def photo_chart(path: Path, rows: list[Row], count: int) -> None:
         "failed lines; the named photograph is the plate, the wall is another drawn at random",
         fontsize=11,
     )
-    figure.savefig(path, dpi=85)
-    plt.close(figure)
+    _save(figure, path, 85)
 
 
 def photo_examples(path: Path, seed: int) -> None:
@@ -413,20 +445,18 @@ def photo_examples(path: Path, seed: int) -> None:
         found = find_lines(seams.strip, mask, seams.reference, detector("ours"))
         column[0].set_title(name, fontsize=10)
         for k, axes in enumerate(column):
-            length, width = mask.shape
-            size = (0, width, length, 0)
+            size = (0, photo_seams.WIDTH, photo_seams.LENGTH, 0)
             axes.imshow(_as_image(seams.strip[k], 0), extent=size, interpolation="nearest")
-            _draw_lines(axes, seams.truth[k], found, k, seams.reference, 0, length)
+            _draw_lines(axes, seams.truth[k], found, k, seams.reference, 0, photo_seams.LENGTH)
             axes.set(xlim=size[:2], ylim=size[2:], xticks=[], yticks=[])
     handles = [
-        Line2D([], [], color=_TRUE, lw=3.2, label="truth"),
+        Line2D([], [], color=_TRUE, lw=2.5, label="truth"),
         Line2D([], [], color=_RAW, lw=1.5, label="ours, raw"),
         Line2D([], [], color=_REFINED, lw=1.5, ls="--", label="ours, refined"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=10)
     figure.suptitle("Seams laid into photographs of scikit-image: the first two of each", fontsize=12)
-    figure.savefig(path, dpi=70)
-    plt.close(figure)
+    _save(figure, path, 85)
 
 
 # -- the command ------------------------------------------------------------------------------------------
@@ -448,9 +478,9 @@ def _page(options: argparse.Namespace, rows: list[Row], usual_db: float) -> str:
     parts = [
         "# Edge methods on single frames",
         f"{options.frames} frames of each part from seed {options.seed} on, two views each, no memory "
-        "between frames. Every method has the same line stage and the settings of `tune_edges.md`; *ours* are "
-        "those that the tracker uses, *ours_tuned* the best for these lines. Medians of the offset from the "
-        "true line at the tip and of the angle over all frames, a missing line counting as "
+        "between frames. Every method has the same line stage and the settings of `tune_edges.md`; *ours* "
+        "are those that the tracker uses, *ours_tuned* the best for these lines. Medians of the offset from "
+        "the true line at the tip and of the angle over all frames, a missing line counting as "
         f"infinitely far off; failed: none, or more than {FAIL_PX:g} px or {FAIL_DEG:g} deg off. The SNR is "
         "the sensors' own: the variance of the noise-free ROI, nozzle included, over that of the noise.",
         f"## As in a run (SNR {usual_db:.1f} dB)",
