@@ -77,13 +77,13 @@ def test_only_photographs_that_come_with_the_package():
 
 def test_a_row_of_photographs():
     pytest.importorskip("skimage")
-    rows = fig12.photo_rows("gravel", 4, 500_000)
+    rows = fig12.photo_rows("gravel", 12, 500_000)
     assert {(r["method"], r["stage"]) for r in rows} == {
         (m, s) for m in fig12.LABELS for s in ("raw", "refined")
     }
     table = fig12.pooled(rows, {"part": "gravel"})
-    assert [r["frames"] for r in table] == [4] * len(table)
-    assert np.median([r["offset_px"] for r in table]) < 0.5
+    assert [r["frames"] for r in table] == [12] * len(table)
+    assert max(r["offset_px"] for r in table) < 0.5
 
 
 @pytest.mark.parametrize("arguments", [["--seed", "1000000"], ["--frames", "0"]])
