@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
-from seal_gym.vision.edges import Bytes, EdgeDetector, EdgeMap, EdgeStage, Mask, check_images
+from seal_gym.vision.edges import Bytes, EdgeCfg, EdgeDetector, EdgeMap, EdgeStage, Mask, check_images
 
 Single = NDArray[np.float32]
 
@@ -55,8 +55,8 @@ class CannyCfg:
     """
 
     sigma_px: float = 1.4
-    share: float = 0.1
-    ratio: float = 0.4
+    share: float = 0.12
+    ratio: float = 0.2
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
@@ -73,8 +73,8 @@ class SobelCfg:
         share: This fraction of the pixels, those of the largest gradients, are edges.
     """
 
-    sigma_px: float = 1.4
-    share: float = 0.1
+    sigma_px: float = 0.7
+    share: float = 0.05
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
@@ -97,8 +97,8 @@ class LsdCfg:
         min_length_px: Shorter segments are dropped [px].
     """
 
-    sigma_px: float = 0.0
-    scale: float = 0.8
+    sigma_px: float = 0.7
+    scale: float = 1.0
     sigma_scale: float = 0.6
     quant: float = 2.0
     angle_deg: float = 22.5
@@ -144,16 +144,16 @@ def _blurred(grey: Single, mask: Mask, sigma_px: float) -> Single:
 
 def _gradient(grey: Single, mask: Mask) -> tuple[Single, Single]:
     """Sobel's differences, zero under the mask [4 grey levels a pixel]."""
-    gx, gy = (
-        np.asarray(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, borderType=cv2.BORDER_REPLICATE))
-        for dx in (1, 0)
-    )
-    gx[mask] = 0.0
-    gy[mask] = 0.0
+
+    def sobel(dx: int, dy: int) -> Single:
+        out = cv2.Sobel(grey, cv2.CV_32F, dx, dy, ksize=3, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.float32)
+
+    gx, gy = sobel(1, 0), sobel(0, 1)
     # Rounding of the blur must not make edges of flat ground.
-    noise = np.hypot(gx, gy) < 1e-2
-    gx[noise] = 0.0
-    gy[noise] = 0.0
+    none = mask | (np.hypot(gx, gy) < 1e-2)
+    gx[none] = 0.0
+    gy[none] = 0.0
     return gx, gy
 
 
@@ -342,10 +342,13 @@ def _draw(ends: Array, vote: float, vector: Array, intensity: Array) -> None:
         vector[at] = vote * bright
 
 
-SOBEL_PLAIN = SobelCfg(sigma_px=0.0, share=0.1)
+SOBEL_PLAIN = SobelCfg(sigma_px=0.0, share=0.05)
+# Our stage's best settings for lines of single frames; the tracker was tuned with ``EdgeCfg``'s own.
+OURS_TUNED = EdgeCfg(alpha=1.0, length=3, a=0.6, b=0.3, c=0.1, tau=0.55, share=0.03)
 
 DETECTORS: dict[str, Callable[[], EdgeDetector]] = {
     "ours": EdgeStage,
+    "ours_tuned": lambda: EdgeStage(OURS_TUNED),
     "canny": CannyEdges,
     "sobel": lambda: SobelEdges(SOBEL_PLAIN),
     "sobel_blurred": SobelEdges,
