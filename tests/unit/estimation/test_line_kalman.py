@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import ConfigError
 from seal_gym.estimation.line_kalman import LineKalman, LineKalmanCfg
+from seal_gym.vision.endpoints import end_points, image_lines
+from seal_gym.vision.features import ViewGeometry
 
 DT = 1 / 30
 ROWS = np.array([-20.0, 40.0])
@@ -177,6 +180,23 @@ def test_reset_forgets_one_row_and_only_chosen_rows_are_updated():
     np.testing.assert_array_equal(out.line[2], one.line[0])
     out = kalman.update(to_line(z[31]), everything)
     np.testing.assert_allclose(to_crossings(out.line[0]), z[31, 0], atol=1e-12)
+
+
+def test_end_points_neither_jump_nor_swap_where_a_filtered_line_passes_the_rois_corner():
+    views = ViewGeometry.of(load_cell())
+    p, rng = np.linspace(20, 40, 240), np.random.default_rng(4)
+    kalman, ends = LineKalman(1, DT), []
+    for k in range(240):
+        # At first both lines leave the ROI at its far end, in the end at the side: 80 rows ahead are 24 px.
+        line = np.array([[[p[k], 0.3], [p[k], 0.3]]]) + rng.normal(0, [0.5, 0.005], (1, 2, 2))
+        out = kalman.update(line, np.ones((1, 2), np.bool_))
+        ends.append(end_points(image_lines(out.line, out.valid, views), views.size).ends[0])
+    front, side = np.array(ends).transpose(1, 0, 2)
+    assert front[0, 3] == pytest.approx(0) and front[-1, 2] == pytest.approx(50)
+    assert side[0, 2] == pytest.approx(100) and side[-1, 3] == pytest.approx(50)
+    assert (front[:, 1] > front[:, 3]).all() and (side[:, 0] < side[:, 2]).all()
+    # An end at the side moves by 1 / 0.3 of what the line does, 0.08 px a frame and the noise that is left.
+    assert np.abs(np.diff([front, side], axis=1))[:, 30:].max() < 2.0
 
 
 @pytest.mark.parametrize(
