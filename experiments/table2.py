@@ -308,7 +308,8 @@ def run(ride: trials.Trial, frames: Path) -> dict[str, Any]:
     film = camera.film()
     counts = film.measured
     truth = features_of(film.truth)[counts]
-    found = {name: values[counts] for name, values in read(film, METHODS).items()}
+    # The figures are those of the numbers in the file, which need no more digits than these.
+    found = {name: values[counts].astype(np.float32) for name, values in read(film, METHODS).items()}
     corner = _corner(ride, film.s_m[counts])
     np.savez_compressed(
         frames / f"{ride.part}-{ride.seed}.npz",
