@@ -321,7 +321,7 @@ def run(ride: trials.Trial, frames: Path) -> dict[str, Any]:
     sums: dict[str, Any] = {}
     for region, chosen in zip(REGIONS, (~corner, corner), strict=True):
         for name, values in found.items():
-            error = error_of(values, truth)[chosen]
+            error = error_of(values.astype(np.float64), truth)[chosen]
             sums.setdefault(name, {})[region] = {
                 "squared": np.nansum(error**2, axis=0).tolist(),
                 "lines": np.isfinite(error).sum(axis=0).tolist(),
