@@ -101,6 +101,17 @@ def markdown(rows: Iterable[Row], columns: dict[str, str]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def _rounded(value: Any) -> Any:
+    """Five digits are more than any figure here is good for."""
+    if isinstance(value, float):
+        return float(f"{value:.5g}")
+    if isinstance(value, list | tuple):
+        return [_rounded(v) for v in value]
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return value
+
+
 def write(out: Path, name: str, arguments: list[str], rows: list[Row], document: Row, page: str) -> None:
     """Writes ``<name>.json``, ``.csv`` and ``.md``.
 
@@ -112,6 +123,7 @@ def write(out: Path, name: str, arguments: list[str], rows: list[Row], document:
         document: More for the JSON file.
         page: The Markdown page.
     """
+    rows = _rounded(rows)
     head = {
         "name": name,
         "version": seal_gym.__version__,

@@ -51,6 +51,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter
 
 # Best at 2 dB by ``tune_edges``.
 IN_NOISE: dict[str, Row] = {
@@ -195,8 +196,14 @@ def _draw_method(axes: Axes, frames: SeamFrames, name: str, view: int) -> None:
     found = find_lines(strip, mask, reference, method)
     _draw_lines(axes, frames.truth[0, view], found, 0, reference, view, length)
     e = stage_errors(found, frames.truth[:, view], reference[1])
-    text = "\n".join(f"{s}: {abs(e[s].offset_px[0]):.2f} px, {abs(e[s].angle_deg[0]):.1f}°" for s in STAGES)
-    axes.set_xlabel(text, fontsize=10)
+    axes.set_xlabel("\n".join(f"{s}: {_error_text(e[s])}" for s in STAGES), fontsize=10)
+
+
+def _error_text(e: LineErrors) -> str:
+    """The errors of a single line."""
+    if not np.isfinite(e.offset_px[0]):
+        return "no line"
+    return f"{abs(e.offset_px[0]):.2f} px, {abs(e.angle_deg[0]):.1f}°"
 
 
 def panels(path: Path, seed: int, view: int) -> None:
@@ -252,13 +259,11 @@ def panels(path: Path, seed: int, view: int) -> None:
 
 
 def _save(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure in 256 colours: sensor noise in full colour makes files of a megabyte."""
+    """Writes a figure without its transparency and packed as small as it will go: noise takes space."""
     buffer = BytesIO()
     figure.savefig(buffer, dpi=dpi)
     plt.close(figure)
-    Image.open(buffer).convert("RGB").quantize(
-        256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-    ).save(path, optimize=True)
+    Image.open(buffer).convert("RGB").save(path, optimize=True)
 
 
 # -- accuracy against the signal-to-noise ratio -----------------------------------------------------------
@@ -342,7 +347,9 @@ def snr_chart(path: Path, rows: list[Row], usual_db: float, settings: str) -> No
                 axes.set_ylim(-3, 103)
             else:
                 axes.set_yscale("log")
+                axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 axes.yaxis.set_major_formatter("{x:g}")
+                axes.yaxis.set_minor_formatter(NullFormatter())
             axes.set_xlim(max(LEVELS_DB) + 0.7, min(LEVELS_DB) - 0.7)
             axes.axvline(usual_db, color="#777777", ls=":", lw=1.2)
             axes.set_title(f"{stage}: {label if share else 'median ' + label}", fontsize=10)
