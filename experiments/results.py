@@ -136,6 +136,7 @@ def write(
     *,
     renderer: str,
     regime: str,
+    text: str | None = None,
 ) -> None:
     """Writes ``<name>.json``, ``.csv`` and ``.md``.
 
@@ -146,6 +147,7 @@ def write(
         trials: What it was made from.
         renderer: Of the sensor images, or ``"none"`` with oracle features.
         regime: ``"static"`` or ``"dynamic"``.
+        text: Markdown for people; by default ``table`` of the rows, which are then a control table's.
     """
     arguments = [a for a in sys.argv[1:]]
     document = {
@@ -164,7 +166,7 @@ def write(
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    (out / f"{name}.md").write_text(table(rows, markdown=True) + "\n", encoding="utf-8")
+    (out / f"{name}.md").write_text((text or table(rows, markdown=True)) + "\n", encoding="utf-8")
 
 
 def _document(document: dict[str, Any]) -> str:

@@ -69,6 +69,9 @@ class Trial:
         }
 
 
+Worker = Callable[[Trial], dict[str, Any]]
+
+
 def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Reads a seam from a CSV file.
 
@@ -201,7 +204,9 @@ def run(trial: Trial, observer: Observer | None = None, render_mode: str | None 
     }
 
 
-def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> list[dict[str, Any]]:
+def run_all(
+    trials: Iterable[Trial], *, jobs: int, log: Path, title: str, work: Worker | None = None
+) -> list[dict[str, Any]]:
     """Runs trials that are not in the log yet, and logs each as it ends.
 
     Args:
@@ -210,6 +215,7 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
         log: A file of JSON lines; what is in it with the same specification, from the same code and
             packages, is not run again.
         title: Of the progress bar.
+        work: What makes a row with ``method`` and ``env_spec`` of a trial, picklable; ``run`` by default.
 
     Returns:
         One row a trial, in the order of ``trials``.
@@ -219,7 +225,7 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
     missing = [t for t in wanted if _key(t.method, t.spec()) not in done]
     with log.open("a", encoding="utf-8") as file:
         for row in tqdm(
-            _results(missing, jobs),
+            _results(missing, jobs, work or run),
             total=len(wanted),
             initial=len(wanted) - len(missing),
             desc=title,
@@ -231,14 +237,14 @@ def run_all(trials: Iterable[Trial], *, jobs: int, log: Path, title: str) -> lis
     return [done[_key(t.method, t.spec())] for t in wanted]
 
 
-def _results(trials: list[Trial], jobs: int) -> Iterator[dict[str, Any]]:
+def _results(trials: list[Trial], jobs: int, work: Worker) -> Iterator[dict[str, Any]]:
     if jobs <= 1 or len(trials) <= 1:
-        yield from map(run, trials)
+        yield from map(work, trials)
         return
     # Fresh processes: a forked one would share OpenGL contexts and threads with this one.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(trials)), mp_context=context, initializer=_one_thread) as pool:
-        for future in as_completed([pool.submit(run, t) for t in trials]):
+        for future in as_completed([pool.submit(work, t) for t in trials]):
             yield future.result()
 
 

@@ -21,6 +21,7 @@ from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 
 Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 _LEVELS = 256.0
 _BINS = 512
@@ -65,22 +66,71 @@ class EdgeCfg:
 
 
 class EdgeMap(NamedTuple):
-    """Edges of N images.
+    """Edges of N images, by whatever method.
 
     Attributes:
-        vector: Edge vector (x, y) over its largest length in the image, shape (N, height, width, 2).
+        vector: Edge vector (x, y), towards the brighter side, over its largest length in the image, shape
+            (N, height, width, 2).
         magnitude: Its length, averaged over 3x3 pixels, shape (N, height, width).
-        orientation: Direction of the steepest ascent or descent, within +-pi/2, for the strongest pixels and
-            their neighbours, else 0, shape (N, height, width), rad.
-        intensity: Edge intensity of the strongest pixels, else 0, shape (N, height, width).
-        edge: Where the intensity reaches tau, shape (N, height, width).
+        orientation: Direction of the steepest ascent or descent, within +-pi/2, at least at the edges, shape
+            (N, height, width), rad.
+        intensity: What an edge pixel's vote for a line is worth, shape (N, height, width).
+        edge: Whether a pixel is an edge, shape (N, height, width).
     """
 
     vector: Array
     magnitude: Array
     orientation: Array
     intensity: Array
-    edge: NDArray[np.bool_]
+    edge: Mask
+
+
+class EdgeDetector(Protocol):
+    """Finds edges: ``EdgeStage``, and the methods it is compared with in ``baselines``."""
+
+    def __call__(self, images: Bytes, mask: Mask | None = None) -> EdgeMap:
+        """Finds the edges of each image by itself.
+
+        Args:
+            images: Grey, shape (N, height, width), or RGB, shape (N, height, width, 3).
+            mask: True where nothing may be an edge, shape (height, width).
+
+        Returns:
+            The edges; an image without any contrast has none.
+        """
+        ...
+
+
+def check_images(images: Bytes, mask: Mask | None) -> tuple[Bytes, Mask]:
+    """What every detector asks of its arguments.
+
+    Args:
+        images: See ``EdgeDetector``.
+        mask: Likewise.
+
+    Returns:
+        The images as RGB, shape (N, height, width, 3), and a mask, shape (height, width).
+
+    Raises:
+        ConfigError: If shape or type are none that a detector takes.
+    """
+    require(
+        images.dtype == np.uint8
+        and images.ndim in (3, 4)
+        and (images.ndim == 3 or images.shape[3] == 3)
+        and min(images.shape[1:3]) >= 3,
+        f"images of {images.dtype}, shape {images.shape}: must be uint8, (N, height, width) or "
+        "(N, height, width, 3), at least 3 px",
+    )
+    size = images.shape[1:3]
+    if mask is None:
+        mask = np.zeros(size, np.bool_)
+    require(
+        mask.dtype == np.bool_ and mask.shape == size,
+        f"mask of {mask.dtype}, shape {mask.shape}: must be bool, {size} as the images",
+    )
+    colour = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
+    return np.ascontiguousarray(colour), np.ascontiguousarray(mask)
 
 
 class EdgeDetector(Protocol):
@@ -144,7 +194,7 @@ def grey_sum(image: Bytes, out: NDArray[np.int64]) -> None:
 @kernel
 def _vectors(
     grey: NDArray[np.int64],
-    mask: NDArray[np.bool_],
+    mask: Mask,
     tap: Array,
     pad: int,
     padded: Array,
@@ -264,7 +314,7 @@ def _contrast(grey: NDArray[np.int64], i: int, j: int, g_log_g: Array) -> float:
 @kernel
 def edge_image(
     grey: NDArray[np.int64],
-    mask: NDArray[np.bool_],
+    mask: Mask,
     tap: Array,
     pad: int,
     par: Array,
@@ -277,7 +327,7 @@ def edge_image(
     magnitude: Array,
     orientation: Array,
     intensity: Array,
-    edge: NDArray[np.bool_],
+    edge: Mask,
 ) -> None:
     """The whole stage for one image, from the sum of its channels; nothing under the mask is an edge.
 
@@ -299,7 +349,7 @@ def edge_image(
     work[:] = 0.0  # 1 where the orientation is known
     for i in range(height):
         for j in range(width):
-            if magnitude[i, j] < cut:
+            if magnitude[i, j] < cut or mask[i, j]:
                 continue
             for y in range(max(i - 1, 0), min(i + 2, height)):
                 for x in range(max(j - 1, 0), min(j + 2, width)):
@@ -321,6 +371,7 @@ def edge_image(
 @kernel
 def _edge_batch(
     images: Bytes,
+    mask: Mask,
     tap: Array,
     pad: int,
     par: Array,
@@ -329,10 +380,10 @@ def _edge_batch(
     magnitude: Array,
     orientation: Array,
     intensity: Array,
-    edge: NDArray[np.bool_],
+    edge: Mask,
 ) -> None:
     n, height, width = images.shape[:3]
-    grey, mask = np.empty((height, width), np.int64), np.zeros((height, width), np.bool_)
+    grey = np.empty((height, width), np.int64)
     padded, work = np.empty((height + 2 * pad, width + 2 * pad)), np.empty((height, width))
     ex, ey, bins = np.empty((height, width)), np.empty((height, width)), np.empty(_BINS, np.int64)
     for k in range(n):
@@ -398,24 +449,17 @@ class EdgeStage:
         self.cfg = cfg or EdgeCfg()
         self._tables = EdgeTables.of(self.cfg)
 
-    def __call__(self, images: Bytes) -> EdgeMap:
+    def __call__(self, images: Bytes, mask: Mask | None = None) -> EdgeMap:
         """Runs the stage.
 
         Args:
             images: Grey, shape (N, height, width), or RGB, shape (N, height, width, 3).
+            mask: True where nothing may be an edge, shape (height, width).
 
         Returns:
             The edges; an image without any contrast has none.
         """
-        require(
-            images.dtype == np.uint8
-            and images.ndim in (3, 4)
-            and (images.ndim == 3 or images.shape[3] == 3)
-            and min(images.shape[1:3]) >= 3,
-            f"images of {images.dtype}, shape {images.shape}: must be uint8, (N, height, width) or "
-            "(N, height, width, 3), at least 3 px",
-        )
-        colour = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
+        colour, mask = check_images(images, mask)
         shape = colour.shape[:3]
         out = EdgeMap(
             np.empty((*shape, 2)),
@@ -424,5 +468,5 @@ class EdgeStage:
             np.empty(shape),
             np.empty(shape, np.bool_),
         )
-        _edge_batch(np.ascontiguousarray(colour), *self._tables, *out)
+        _edge_batch(colour, mask, *self._tables, *out)
         return out

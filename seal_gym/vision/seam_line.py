@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
-from seal_gym.vision.edges import EdgeTables, edge_image
+from seal_gym.vision.edges import EdgeDetector, grey_sum
 
 Grey = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -96,7 +96,7 @@ class StripLine(NamedTuple):
 
     Attributes:
         line: p, q of the tangent at the seam's point nearest the reference, and its t, shape (N, 3), px.
-        raw: p, q of RANSAC's unrefined line, shape (N, 2), px.
+        raw: p, q of RANSAC's unrefined line, NaN where it found none, shape (N, 2), px.
         confidence: Mean step of the edges found [grey levels]; 0 without a line, shape (N,).
         valid: Whether there is a line, shape (N,).
     """
@@ -516,10 +516,9 @@ def _find_batch(
     images: NDArray[np.uint8],
     mask: Mask,
     reference: Array,
-    tap: Array,
-    pad: int,
-    edge_par: Array,
-    g_log_g: Array,
+    vector: Array,
+    intensity: Array,
+    edge: Mask,
     par: Array,
     line: Array,
     raw: Array,
@@ -528,39 +527,18 @@ def _find_batch(
 ) -> None:
     n, height, width = images.shape[:3]
     grey = np.empty((height, width), np.int64)
-    padded, work = np.empty((height + 2 * pad, width + 2 * pad)), np.empty((height, width))
-    ex, ey, bins = np.empty((height, width)), np.empty((height, width)), np.empty(512, np.int64)
-    magnitude, orientation = np.empty((height, width)), np.empty((height, width))
-    intensity, edge = np.empty((height, width)), np.empty((height, width), np.bool_)
+    ex, ey = np.empty((height, width)), np.empty((height, width))
     profile, points, columns = np.empty(64), np.empty((2 * height, 3)), np.empty((3, 2 * height))
     for k in range(n):
+        valid[k], confidence[k] = False, 0.0
         for i in range(height):
             for j in range(width):
-                grey[i, j] = (
-                    np.int64(images[k, i, j, 0]) + np.int64(images[k, i, j, 1]) + np.int64(images[k, i, j, 2])
-                )
-        edge_image(
-            grey,
-            mask,
-            tap,
-            pad,
-            edge_par,
-            g_log_g,
-            padded,
-            work,
-            bins,
-            ex,
-            ey,
-            magnitude,
-            orientation,
-            intensity,
-            edge,
-        )
-        valid[k], confidence[k] = False, 0.0
-        if not ransac_line(edge, mask, intensity, ex, ey, reference[0], par, raw[k]):
+                ex[i, j], ey[i, j] = vector[k, i, j, 0], vector[k, i, j, 1]
+        if not ransac_line(edge[k], mask, intensity[k], ex, ey, reference[0], par, raw[k]):
             continue
+        grey_sum(images[k], grey)
         p, q = raw[k, 0], raw[k, 1]
-        count = follow(grey, mask, edge, reference[0], p, q, par[8], par[8], par, profile, points)
+        count = follow(grey, mask, edge[k], reference[0], p, q, par[8], par[8], par, profile, points)
         confidence[k] = local_line(points, count, reference[0], reference[1], p, par, columns, line[k])
         valid[k] = confidence[k] > 0.0
 
@@ -569,7 +547,7 @@ def find_lines(
     images: NDArray[np.uint8],
     mask: Mask,
     reference: Array,
-    edges: EdgeTables,
+    detector: EdgeDetector,
     cfg: LineCfg | None = None,
 ) -> StripLine:
     """Finds the seam's line in strips, each by itself.
@@ -578,13 +556,15 @@ def find_lines(
         images: Strips, shape (N, length, width, 3).
         mask: Where the nozzle is, shape (length, width).
         reference: t and o of the point one stand-off before the nozzle mouth, shape (2,), px.
-        edges: The edge stage.
+        detector: Finds the edges.
         cfg: Parameters.
 
     Returns:
         The lines; without one, ``valid`` is false.
     """
     n = len(images)
-    out = StripLine(np.zeros((n, 3)), np.zeros((n, 2)), np.zeros(n), np.zeros(n, np.bool_))
-    _find_batch(images, mask, reference, *edges, (cfg or LineCfg()).table, *out)
+    edges = detector(images, mask)
+    out = StripLine(np.zeros((n, 3)), np.full((n, 2), np.nan), np.zeros(n), np.zeros(n, np.bool_))
+    found = (edges.vector, edges.intensity, edges.edge)
+    _find_batch(np.ascontiguousarray(images), mask, reference, *found, (cfg or LineCfg()).table, *out)
     return out

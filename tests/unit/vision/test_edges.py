@@ -192,6 +192,26 @@ def test_intensity_is_relative_to_what_is_outside_the_mask():
     assert not plain[5][mask].any()
 
 
+def test_the_mask_of_the_stage_is_that_of_the_kernel():
+    rng = np.random.default_rng(5)
+    images = rng.integers(0, 120, (2, 40, 30, 3), dtype=np.uint8)
+    mask = np.zeros((40, 30), np.bool_)
+    mask[25:, 15:] = True
+    nozzle = images.copy()
+    nozzle[:, 29:, 19:] = 255  # further under the mask than the masks reach
+    for a, b in zip(EdgeStage()(images, mask), EdgeStage()(nozzle, mask), strict=True):
+        np.testing.assert_array_equal(a[:, ~mask], b[:, ~mask])
+    out = EdgeStage()(images, mask)
+    assert not out.edge[:, mask].any() and out.edge[:, ~mask].any()
+    assert not EdgeStage()(images, np.ones_like(mask)).edge.any()
+
+
+@pytest.mark.parametrize("mask", [np.zeros((9, 8), np.bool_), np.zeros((9, 9), np.uint8)])
+def test_a_mask_of_another_size_is_refused(mask):
+    with pytest.raises(ConfigError, match="mask"):
+        EdgeStage()(np.zeros((1, 9, 9), np.uint8), mask)
+
+
 @pytest.mark.parametrize(
     "kwargs", [{"alpha": 0.0}, {"alpha": 1.5}, {"length": 1}, {"a": -1.0}, {"tau": np.nan}, {"share": 0.0}]
 )

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from seal_gym.core.errors import ConfigError
-from seal_gym.vision.edges import EdgeCfg, EdgeTables
+from seal_gym.vision.edges import EdgeMap, EdgeStage
 from seal_gym.vision.seam_line import LineCfg, dilated, find_lines, fit_curve, strips
 
 HEIGHT, WIDTH = 100, 50
 REFERENCE = np.array([25.4, 25.0])
-EDGES = EdgeTables.of(EdgeCfg())
+EDGES = EdgeStage()
 NO_MASK = np.zeros((HEIGHT, WIDTH), np.bool_)
 FREE = (0.0, 0.0, 0.0)
 
@@ -73,7 +73,8 @@ def test_an_edge_of_the_wrong_polarity_is_not_a_seam():
 @pytest.mark.parametrize("seed", range(10))
 def test_without_contrast_there_is_no_line(seed):
     assert not find(draw(lambda t: 25.0 + 0 * t, dark=100.0, bright=100.0, seed=seed)).valid[0]
-    assert not find(np.full((HEIGHT, WIDTH, 3), 255, np.uint8)).valid[0]
+    nothing = find(np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+    assert not nothing.valid[0] and np.isnan(nothing.raw).all()
 
 
 def test_what_the_mask_hides_is_not_seen():
@@ -85,6 +86,25 @@ def test_what_the_mask_hides_is_not_seen():
     out = find(image, mask=mask)
     assert out.valid[0] and out.line[0, 0] == pytest.approx(20.0, abs=0.5)
     assert not find(image, mask=np.ones_like(mask)).valid[0]
+
+
+def test_any_detector_will_do():
+    """One that is told where the edge is: the line goes through its pixels and nowhere else."""
+
+    def told(images, mask=None):
+        shape = images.shape[:3]
+        edge = np.zeros(shape, np.bool_)
+        edge[:, 5:95, 18] = True
+        vector = np.zeros((*shape, 2))
+        vector[..., 0] = edge
+        return EdgeMap(vector, vector[..., 0], np.zeros(shape), edge.astype(float), edge)
+
+    # A weaker edge at 18.5, where the detector points; a stronger one at 35.
+    image = draw(lambda t: 18.5 + 0 * t, bright=90.0).astype(int)
+    image[:, 35:] += 60
+    out = find_lines(image.astype(np.uint8)[None], NO_MASK, REFERENCE, told)
+    assert out.raw[0] == pytest.approx([18.5, 0.0], abs=1e-9)
+    assert out.valid[0] and out.line[0, 0] == pytest.approx(18.5, abs=0.5)
 
 
 def test_each_strip_by_itself_and_the_same_every_time():
