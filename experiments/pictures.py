@@ -1,5 +1,7 @@
 """Plots and videos of a run."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from seal_gym.core.frames import Array
 from seal_gym.envs.seal_env import SealEnv
 
 mpl.use("Agg")  # no screen needed
@@ -152,3 +155,118 @@ class Recorder:
             axes.grid(color="#dddddd", lw=0.6)
         figure.savefig(path, dpi=110)
         plt.close(figure)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureTrace:
+    """The features of a run of T frames beside the truth; two columns are front and side view.
+
+    Attributes:
+        arc_mm: Arc length of the seam's point nearest the tip, shape (T,), mm.
+        true_d_mm: Attraction distances from the true geometry, shape (T, 2), mm.
+        seen_d_mm: As perception gave them, shape (T, 2), mm.
+        true_theta_deg: Seam angles from the true geometry, shape (T, 2), deg.
+        seen_theta_deg: As perception gave them, shape (T, 2), deg.
+        error_px: Error of the attraction distance in the image, shape (T, 2), px.
+        valid: Whether the view showed the seam, shape (T, 2).
+        tip_error_mm: Distance from the tip to the desired path, shape (T,), mm.
+        snr_db: Signal-to-noise ratio of the images, shape (T, 2), dB.
+        corners_mm: Arc-length intervals of the seam's corners, shape (k, 2), mm.
+    """
+
+    arc_mm: Array
+    true_d_mm: Array
+    seen_d_mm: Array
+    true_theta_deg: Array
+    seen_theta_deg: Array
+    error_px: Array
+    valid: NDArray[np.bool_]
+    tip_error_mm: Array
+    snr_db: Array
+    corners_mm: Array
+
+    @property
+    def sealing(self) -> NDArray[np.bool_]:
+        """Frames from 10 mm of travel on, as protocol.md counts errors, shape (T,)."""
+        return np.asarray(self.arc_mm >= 10.0)
+
+    @property
+    def d_error_mm(self) -> Array:
+        """Error of the attraction distances, shape (T, 2), mm."""
+        return self.seen_d_mm - self.true_d_mm
+
+    @property
+    def theta_error_deg(self) -> Array:
+        """Error of the seam angles, shape (T, 2), deg."""
+        return self.seen_theta_deg - self.true_theta_deg
+
+
+def plot_features(
+    path: Path, title: str, run: FeatureTrace, rois: Sequence[NDArray[np.uint8]], worst_mm: float
+) -> None:
+    """Plots a run's features, true and estimated, their errors and the tip's, and what the cameras saw.
+
+    Args:
+        path: The PNG file.
+        title: Above the plots.
+        run: The run's numbers.
+        rois: Both ROIs with their marks where the error was largest.
+        worst_mm: Arc length of that frame [mm].
+    """
+    figure = plt.figure(figsize=(13.0, 15.0), constrained_layout=True)
+    figure.suptitle(title, fontsize=13)
+    grid = figure.add_gridspec(6, 2, height_ratios=(1, 0.8, 1, 0.8, 1.1, 1.9))
+    rows = (
+        ("d [mm]", run.true_d_mm, run.seen_d_mm, run.d_error_mm),
+        ("theta [deg]", run.true_theta_deg, run.seen_theta_deg, run.theta_error_deg),
+    )
+    for v, view in enumerate(("front view", "side view")):
+        for k, (label, true, seen, error) in enumerate(rows):
+            values, errors = (figure.add_subplot(grid[2 * k + i, v]) for i in (0, 1))
+            shown = np.where(run.valid[:, v], seen[:, v], np.nan)
+            values.plot(run.arc_mm, true[:, v], color=_GREY, lw=3.0, alpha=0.7, label="true")
+            values.plot(run.arc_mm, shown, color=_BLUE, lw=0.9, label="estimated")
+            values.set(title=f"{view}: {label}", ylabel=label)
+            _limit(values, run.sealing, true[:, v], seen[:, v])
+            wrong = np.where(run.valid[:, v], error[:, v], np.nan)
+            errors.plot(run.arc_mm, wrong, color=_RED, lw=0.9)
+            used = error[run.sealing & run.valid[:, v], v]
+            rms = np.sqrt(np.mean(used**2)) if len(used) else np.nan
+            errors.set(ylabel=f"error {label.split()[1]}", title=f"error, RMS {rms:.3f} {label.split()[1]}")
+            errors.axhline(0.0, color=_GREY, lw=0.6)
+            _limit(errors, run.sealing, error[:, v])
+            for axes in (values, errors):
+                _along(axes, run)
+            if v == k == 0:
+                values.legend(loc="best", fontsize=9)
+    tip = figure.add_subplot(grid[4, :])
+    tip.semilogy(run.arc_mm, np.maximum(run.tip_error_mm, 1e-4), color=_RED, lw=1.0)
+    tip.axvline(worst_mm, color=_BLUE, lw=1.0, ls=":")
+    tip.set(title="tip error [mm]; dotted: where the pictures below were taken", ylabel="tip error [mm]")
+    tip.set_xlabel(
+        "along the seam [mm]; shaded: corners; errors count from 10 mm on (the approach is cut off)"
+    )
+    _along(tip, run)
+    for v, (view, picture) in enumerate(zip(("front", "side"), rois, strict=True)):
+        axes = figure.add_subplot(grid[5, v])
+        axes.imshow(picture)
+        axes.set_title(f"{view} view at {worst_mm:.0f} mm, the largest error of d")
+        axes.axis("off")
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+
+
+def _along(axes: Any, run: FeatureTrace) -> None:
+    """The common axis: arc length, the corners shaded."""
+    for first, last in run.corners_mm:
+        axes.axvspan(first, last, color="#f2d9a0", alpha=0.7, lw=0)
+    axes.set_xlim(min(0.0, float(run.arc_mm.max()) - 1.0), float(run.arc_mm.max()))
+    axes.grid(color="#dddddd", lw=0.6)
+
+
+def _limit(axes: Any, sealing: NDArray[np.bool_], *curves: Array) -> None:
+    """Limits the ordinate to what counts: the approach is a hundred times larger."""
+    values = np.concatenate([c[sealing] for c in curves])
+    if len(values):
+        reach = max(1.15 * float(np.abs(values).max()), 1e-3)
+        axes.set_ylim(-reach, reach)

@@ -14,6 +14,7 @@ from seal_gym.rmp import (
     Leaf,
     SealingCfg,
     SeamErrors,
+    TipRmp,
     cholesky_metric,
     fixed_policies,
     joint_limits,
@@ -25,6 +26,8 @@ from seal_gym.rmp import (
 CONTROLS = ("tip", "rmp", "joint")
 # An action entry of 1 is a Cholesky entry of 2, a metric of 4: the expert's weights are at most about 1.
 CHOLESKY_SCALE = 2.0
+# What ``seal_gym.rmp.fixed_policies`` gives, in its order.
+FIXED_POLICIES = ("damping", "regularisation", "lean")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,15 +127,26 @@ class RmpAdapter:
         self._speed = cell.process.speed_m_s
         self._sealing = sealing or SealingCfg()
 
+    def tip_policies(self, action: Array, state: ArmState) -> dict[str, TipRmp]:
+        """The policies on the tip that a call resolves, by name; a look at them changes nothing.
+
+        Args:
+            action: In [-1, 1], shape (N, 27).
+            state: Of the arms.
+
+        Returns:
+            ``policy``, the action's, then the fixed ones: ``damping``, ``regularisation``, ``lean``.
+        """
+        policy = TipRmp(action[:, :6] * self._scale, cholesky_metric(CHOLESKY_SCALE * action[:, 6:]))
+        reference = reference_twist(self._speed, state.seam_twist)
+        fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
+        return {"policy": policy, **dict(zip(FIXED_POLICIES, fixed, strict=True))}
+
     def __call__(self, action: Array, state: ArmState) -> Array:
         """See ``Adapter``."""
         jacobian, drift = state.tip.jacobian, state.tip.drift
-        accel = action[:, :6] * self._scale
-        metric = cholesky_metric(CHOLESKY_SCALE * action[:, 6:])
-        reference = reference_twist(self._speed, state.seam_twist)
-        fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
-        leaves = [on_tip(accel, metric, jacobian, drift)]
-        leaves += [on_tip(*policy, jacobian, drift) for policy in fixed]
+        policies = self.tip_policies(action, state)
+        leaves = [on_tip(*policy, jacobian, drift) for policy in policies.values()]
         leaves.append(joint_limits(state.q, state.qd, JOINT_LOWER, JOINT_UPPER))
         leaves += [_checked_leaf(leaf, state) for leaf in self.leaves]
         return resolve(leaves, jacobian)

@@ -144,7 +144,7 @@ class SealSb3VecEnv(VecEnv):
         """A picture of row 0.
 
         Returns:
-            One picture of shape (720, 960, 3); one None without ``render_mode="rgb_array"``.
+            One picture of shape (720, 1280, 3); one None without ``render_mode="rgb_array"``.
 
         Raises:
             RenderError: If this machine cannot make pictures.

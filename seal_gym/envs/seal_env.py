@@ -104,7 +104,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     ## Arguments
 
     See ``SealCfg`` for the keyword arguments; ``render_mode``: ``None``, ``"rgb_array"`` (third-person view
-    with the ROIs as insets, 720 x 960) or ``"human"`` (MuJoCo's viewer).
+    with the ROIs as insets, 720 x 1280) or ``"human"`` (MuJoCo's viewer).
 
     ## Version history
 
@@ -197,7 +197,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         """A picture of the cell with the ROIs as insets, or nothing with the viewer.
 
         Returns:
-            Shape (720, 960, 3) with ``render_mode="rgb_array"``.
+            Shape (720, 1280, 3) with ``render_mode="rgb_array"``.
 
         Raises:
             RenderError: If this machine cannot make pictures.

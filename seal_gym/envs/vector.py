@@ -237,7 +237,7 @@ class SealVectorEnv(VectorEnv, EzPickle):
         """A picture of row 0, or nothing with the viewer.
 
         Returns:
-            One picture of shape (720, 960, 3) with ``render_mode="rgb_array"``.
+            One picture of shape (720, 1280, 3) with ``render_mode="rgb_array"``.
 
         Raises:
             RenderError: If this machine cannot make pictures.

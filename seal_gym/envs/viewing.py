@@ -13,17 +13,22 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import RenderError, require
 from seal_gym.core.frames import Array, normalise
 from seal_gym.sim.scene import GROUP_COLLISION
+from seal_gym.vision import overlay
+from seal_gym.vision.features import ViewGeometry
 
 if TYPE_CHECKING:
     from seal_gym.envs.core import SealCore
 
-HEIGHT, WIDTH = 720, 960
-_PANEL = 304
-_ZOOM = 3
+HEIGHT, WIDTH = 720, 1280
+_PANEL = 624
+_GAP = 8
+_LABEL = 28  # height of a heading
+_INSET = (400, 200)  # the longer and the shorter side of an ROI, enlarged
 _BACK_RGB = (28, 30, 34)
+_DIM_RGB = (150, 154, 160)
 _TEXT_RGB = (235, 235, 235)
-_LINE_RGB = (64, 220, 90)
-_TIP_RGB = (255, 70, 60)
+_LOST_RGB = (255, 170, 40)
+_COLUMNS = (0, 82, 172, 272, 352)
 _TRAIL_RGBA = np.array([1.0, 0.45, 0.10, 1.0], np.float32)
 _TRAIL_STEP_M = 2e-3
 _TRAIL_RADIUS_M = 8e-4
@@ -47,27 +52,22 @@ def check_render_mode(render_mode: str | None, allowed: list[str]) -> None:
     )
 
 
-def roi_inset(image: NDArray[np.uint8], point: Any, direction: Any, tip: Any) -> NDArray[np.uint8]:
-    """An ROI enlarged, with the seam line and the nozzle mouth drawn in.
+def fitted(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Shrinks a picture that is too large for its place, in proportion.
 
     Args:
-        image: Shape (H, W, 3).
-        point: A point on the line, shape (2,), px; None without a line.
-        direction: The line's direction, shape (2,).
-        tip: The nozzle mouth, shape (2,), px.
+        picture: Shape (H, W, 3).
+        width: Of the place [px].
+        height: Of the place [px].
 
     Returns:
-        Shape (3 H, 3 W, 3).
+        The picture, or a smaller copy.
     """
-    height, width = image.shape[:2]
-    big = cv2.resize(image, (width * _ZOOM, height * _ZOOM), interpolation=cv2.INTER_NEAREST)
-    if point is not None:
-        step = 300.0 * np.asarray(direction) / max(float(np.linalg.norm(direction)), 1e-9)
-        ends = [tuple(round(_ZOOM * v) for v in np.asarray(point) + s * step) for s in (-1, 1)]
-        cv2.line(big, ends[0], ends[1], _LINE_RGB, 1, cv2.LINE_AA)
-    centre = tuple(round(_ZOOM * v) for v in tip)
-    cv2.drawMarker(big, centre, _TIP_RGB, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
-    return np.asarray(big, dtype=np.uint8)
+    share = min(width / picture.shape[1], height / picture.shape[0])
+    if share >= 1.0:
+        return picture
+    size = (max(int(picture.shape[1] * share), 1), max(int(picture.shape[0] * share), 1))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 class SceneView:
@@ -80,6 +80,8 @@ class SceneView:
             core: What to show.
         """
         self._core = core
+        self._views = ViewGeometry.of(core.cfg.cell)
+        self._snr_db = np.zeros(2)
         self._renderers: dict[str, mujoco.Renderer] = {}
         self._trail: list[Array] = []
         self._frame = 0
@@ -87,42 +89,76 @@ class SceneView:
         self._viewer_data: mujoco.MjData | None = None
 
     def picture(self) -> NDArray[np.uint8]:
-        """The nozzle from ahead on its free side; beside it the two ROIs and the whole cell.
+        """The nozzle from ahead on its free side; beside it what the cameras saw, and the whole cell.
 
         The orange trail is the way of the nozzle mouth on the part.
 
         Returns:
-            Shape (720, 960, 3), RGB.
+            Shape (720, 1280, 3), RGB.
 
         Raises:
             RenderError: If no OpenGL context can be made here.
         """
         self._extend_trail()
         out = np.full((HEIGHT, WIDTH, 3), _BACK_RGB, np.uint8)
-        out[:, : WIDTH - _PANEL] = self._shot("nozzle", HEIGHT, WIDTH - _PANEL, self._close())
-        core = self._core
-        images = core.sensors.images(core.tip.pose, core.arm, core.frames)
-        top = 0
-        for v, (camera, image) in enumerate(zip(core.cfg.cell.cameras, images[:2], strict=True)):
-            seen = bool(core.features.valid[0, v])
-            line = core.lines
-            inset = roi_inset(
-                image[0], line.point[0, v] if seen else None, line.direction[0, v], camera.tip_px
-            )
-            top = self._place(out, inset, top, f"{camera.name} view")
-        height = HEIGHT - top - 30
-        self._place(out, self._shot("cell", height, _PANEL - 4, self._wide()), top, "cell")
+        left = WIDTH - _PANEL
+        out[:, :left] = self._shot("nozzle", HEIGHT, left, self._close())
+        long, short = _INSET
+        front, side = self._insets()
+        self._place(out, front, left + _GAP, _LABEL, "front view")
+        right = left + 2 * _GAP + short
+        self._place(out, side, right, _LABEL, "side view")
+        facts = self._facts(WIDTH - _GAP - right)
+        self._place(out, facts, right, _LABEL + short + _GAP, "")
+        top = _LABEL + long + _LABEL
+        cell = self._shot("cell", HEIGHT - top - _GAP, _PANEL - 2 * _GAP, self._wide())
+        self._place(out, cell, left + _GAP, top, "cell")
         return out
 
     @staticmethod
-    def _place(out: NDArray[np.uint8], inset: NDArray[np.uint8], top: int, label: str) -> int:
-        """Puts an inset and its label into the panel; returns where the next one goes."""
+    def _place(out: NDArray[np.uint8], inset: NDArray[np.uint8], left: int, top: int, label: str) -> None:
+        """Puts an inset into the panel, its label above it."""
         height, width = inset.shape[:2]
-        left = WIDTH - _PANEL + (_PANEL - width) // 2
-        where = (left, top + 20)
-        cv2.putText(out, label, where, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
-        out[top + 28 : top + 28 + height, left : left + width] = inset
-        return int(top + 28 + height)
+        overlay.write(out, label, (left, top - 8), size=0.5)
+        out[top : top + height, left : left + width] = inset
+
+    def _insets(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Both ROIs with what perception made of them; the line stage alone where it is by vision."""
+        core = self._core
+        # The same frame has the same noise: these are the images that perception saw.
+        images = core.sensors.images(core.tip.pose, core.arm, core.frames)
+        self._snr_db = images.snr_db[0]
+        shown = (images.front[0], images.side[0])
+        stages = None
+        if core.cfg.perception == "vision":
+            stages = overlay.line_stage(*shown, core.sensors.nozzle, self._views)
+        marks = overlay.view_marks(core.lines, self._views, 0, stages)
+        long, short = _INSET
+        places = ((short, long), (long, short))
+        pictures = []
+        for image, seen, (width, height) in zip(shown, marks, places, strict=True):
+            scale = max(min(width // image.shape[1], height // image.shape[0]), 1)
+            pictures.append(fitted(overlay.draw(image, seen, scale), width, height))
+        return pictures[0], pictures[1]
+
+    def _facts(self, width: int) -> NDArray[np.uint8]:
+        """The features in numbers, and the legend of the insets."""
+        f = self._core.features
+        rows = [("", "d [mm]", "theta [deg]", "SNR [dB]", "seam")]
+        for v, camera in enumerate(self._core.cfg.cell.cameras):
+            d, theta = 1e3 * f.d_m[0, v], np.rad2deg(f.theta_rad[0, v])
+            state = "valid" if f.valid[0, v] else "lost"
+            # + 0.0: no minus before a rounded zero
+            d, theta = round(float(d), 2) + 0.0, round(float(theta), 1) + 0.0
+            rows.append((camera.name, f"{d:+.2f}", f"{theta:+.1f}", f"{self._snr_db[v]:.1f}", state))
+        table = np.full((24 * len(rows) + 6, width, 3), _BACK_RGB, np.uint8)
+        for k, row in enumerate(rows):
+            lost = row[4] == "lost"
+            for x, text in zip(_COLUMNS, row, strict=True):
+                rgb = _LOST_RGB if text == "lost" else _DIM_RGB if lost or k == 0 else _TEXT_RGB
+                overlay.write(table, text, (x, 24 * k + 16), rgb)
+        legend = overlay.legend(width, vision=self._core.cfg.perception == "vision", columns=1)
+        return np.concatenate((table, legend))
 
     def _shot(self, name: str, height: int, width: int, camera: mujoco.MjvCamera) -> NDArray[np.uint8]:
         from seal_gym.sim.gl import offscreen  # loads OpenGL: only for pictures

@@ -267,7 +267,7 @@ def test_rgb_array(make, env_id):
     env = make(env_id, render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
-    assert first.shape == (720, 960, 3) and first.dtype == np.uint8
+    assert first.shape == (720, 1280, 3) and first.dtype == np.uint8
     assert first.std() > 10
     for _ in range(10):
         env.step(np.array([0, 0, 0.5, 0, 0, 0], np.float32))

@@ -212,5 +212,5 @@ def test_errors():
 def test_pictures():
     env = make_sb3_vec("SealGym/Flat-v0", 2, render_mode="rgb_array")
     env.reset()
-    assert env.render().shape == (720, 960, 3)
+    assert env.render().shape == (720, 1280, 3)
     env.close()

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 import seal_gym  # noqa: F401  # registers the ids
+from agents.expert import RmpExpert
 from seal_gym.core.errors import ConfigError, RenderError
 from seal_gym.envs import viewing
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
+from seal_gym.vision import overlay
 
 
 def core():
@@ -18,40 +20,100 @@ def core():
     return c
 
 
-def test_the_inset_shows_the_roi_with_line_and_mouth():
-    image = np.full((100, 50, 3), 90, np.uint8)
-    image[40, 10] = (250, 0, 0)
-    inset = viewing.roi_inset(image, np.array([25.0, 0.0]), np.array([0.0, 1.0]), (25.0, 80.0))
-    assert inset.shape == (300, 150, 3)
-    np.testing.assert_array_equal(inset[121, 31], (250, 0, 0))  # pixel (10, 40), three times as large
-    green = np.flatnonzero(inset[10, :, 1] > inset[10, :, 0].astype(int) + 20)
-    assert green.mean() == pytest.approx(75, abs=1)
-    red = np.argwhere((inset.astype(int)[..., 0] > 200) & (inset.astype(int)[..., 1] < 100))
-    red = red[red[:, 0] > 200]
-    np.testing.assert_allclose(red.mean(axis=0), [240, 75], atol=1.5)
-
-
-def test_without_a_line_none_is_drawn():
-    inset = viewing.roi_inset(np.zeros((100, 50, 3), np.uint8), None, np.zeros(2), (25.0, 80.0))
-    assert not (inset[..., 1] > inset[..., 0].astype(int) + 20).any()
-
-
+@pytest.mark.parametrize("perception", ["oracle", "vision"])
 @pytest.mark.gl
-def test_the_picture_holds_the_scene_and_both_rois():
-    env = gym.make("SealGym/Cylinder-v0", render_mode="rgb_array", disable_env_checker=True)
+def test_the_picture_holds_the_scene_and_both_rois(perception):
+    env = gym.make(
+        "SealGym/Cylinder-v0", render_mode="rgb_array", perception=perception, disable_env_checker=True
+    )
     env.reset(seed=1)
     picture = env.render()
-    assert picture.shape == (viewing.HEIGHT, viewing.WIDTH, 3)
+    assert picture.shape == (viewing.HEIGHT, viewing.WIDTH, 3) == (720, 1280, 3)
     c = env.unwrapped.core
     images = c.sensors.images(c.tip.pose, c.arm, c.frames)
     left = viewing.WIDTH - viewing._PANEL
-    shown = picture[28 : 28 + 300, left + 77 : left + 77 + 150][1::3, 1::3]
-    plain = np.abs(shown.astype(int) - images.front[0]).max(axis=-1) == 0
-    assert plain.mean() > 0.9  # all but the line and the cross
+    insets = ((images.front[0], left + 8), (images.side[0], left + 8 + 200 + 8))
+    shares = []
+    for image, x in insets:
+        height, width = image.shape[:2]
+        shown = picture[28 : 28 + 4 * height, x : x + 4 * width]
+        corners = shown[::4, ::4]  # the marks cover few corners of the enlarged pixels
+        plain = np.abs(corners.astype(int) - image).max(axis=-1) == 0
+        shares.append(plain.mean())
+        orange = np.abs(shown.astype(int) - overlay.CANDIDATE_RGB).max(axis=-1) < 40
+        assert (orange.sum() > 200) == (perception == "vision")  # the oracle has no edge pixels
+    assert min(shares) > 0.85
     assert picture[:, :left].std() > 20
     np.testing.assert_array_equal(env.render(), picture)  # the same again: pictures change nothing
     env.close()
     env.close()
+
+
+@pytest.mark.gl
+def test_the_gun_is_not_hidden_by_an_inset():
+    """The mouth is in the middle of the main picture, far from the panel."""
+    env = gym.make("SealGym/Flat-v0", render_mode="rgb_array", disable_env_checker=True)
+    env.reset(seed=0)
+    camera = env.unwrapped._view._close()
+    mouth = env.unwrapped.core.tip.pose[0, :3, 3]
+    azimuth, elevation = np.deg2rad([camera.azimuth, camera.elevation])
+    forward = np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    offset = mouth - (np.asarray(camera.lookat) - camera.distance * forward)
+    half_height = np.tan(np.deg2rad(45.0 / 2))  # MuJoCo's free camera
+    x = (offset @ right) / (offset @ forward) / half_height * viewing.HEIGHT / 2
+    assert abs(x) < 0.25 * (viewing.WIDTH - viewing._PANEL)
+    env.close()
+
+
+@pytest.mark.parametrize("perception", ["oracle", "vision"])
+@pytest.mark.gl
+def test_rendering_changes_no_number(perception):
+    """The same seed with a picture after each step and without: equal to the bit."""
+    kwargs = {"perception": perception, "control": "rmp", "disable_env_checker": True}
+    seen = gym.make("SealGym/Rectangular-v0", render_mode="rgb_array", **kwargs)
+    blind = gym.make("SealGym/Rectangular-v0", **kwargs)
+    expert = RmpExpert()
+    (o, info), (p, plain) = seen.reset(seed=5), blind.reset(seed=5)
+    for _ in range(25):
+        assert seen.render() is not None
+        np.testing.assert_array_equal(o, p)
+        assert info["roi"] == plain["roi"] and info["tip_error_mm"] == plain["tip_error_mm"]
+        assert info.keys() == plain.keys()
+        (o, r, _, _, info), (p, q, _, _, plain) = (
+            e.step(expert.predict(x)[0]) for e, x in ((seen, o), (blind, p))
+        )
+        assert r == q
+    np.testing.assert_array_equal(seen.unwrapped.core.arm.q, blind.unwrapped.core.arm.q)
+    seen.close()
+    blind.close()
+
+
+def ink(picture):
+    return (np.abs(picture.astype(int) - viewing._BACK_RGB).max(axis=-1) > 60).sum()
+
+
+def test_a_lost_view_is_named_in_the_panel():
+    c = core()
+    view = viewing.SceneView(c)
+    view._insets()
+    found = view._facts(400)
+    c.features.valid[0, 1] = False
+    lost = view._facts(400)
+    orange = np.abs(lost[:72].astype(int) - viewing._LOST_RGB).max(axis=-1) < 40
+    rows = np.flatnonzero(orange.any(axis=1))
+    assert len(rows) and rows.min() >= 48  # the side view's row of the table
+    assert not (np.abs(found.astype(int) - viewing._LOST_RGB).max(axis=-1) < 40)[:72].any()
+    assert ink(found) > 500
+
+
+def test_pictures_that_are_too_large_are_shrunk_in_proportion():
+    big = np.zeros((400, 900, 3), np.uint8)
+    assert viewing.fitted(big, 300, 200).shape == (133, 300, 3)
+    assert viewing.fitted(big, 900, 400) is big
 
 
 @pytest.mark.gl
