@@ -1,17 +1,28 @@
 """Markers as cameras see them: pictures of a flat print without OpenGL, and labels in a MuJoCo scene."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from seal_gym.core.cell import MarkerCfg
 from seal_gym.core.errors import SeamError, is_number, require
 from seal_gym.core.frames import Array, quat_from_matrix, transform
+from seal_gym.vision.part_pose import PartMarker
 from seal_gym.workpieces.workpiece import Workpiece
 
 Grey = NDArray[np.uint8]
+# A label's corners (times half its size), counter-clockwise from the lower left, and its texture's.
+_QUAD = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+_QUAD_UV = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+# Above the plate, so that the two do not flicker through each other.
+_PAPER_M = 1e-4
+# Reflectance of white paper; more, and the lamps of the scene drive it into the sensor's limit.
+_PAPER_GREY = 0.7
+# How places are searched: grid, how flat the plate has to be, and how far from what stands on it.
+_STEP_M, _FLAT_M, _CLEAR_M = 2.5e-3, 1e-5, 5e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +58,7 @@ class ShotCfg:
             f"ShotCfg.blur_px = {self.blur_px!r}: must be within 0..10",
         )
         require(
-            isinstance(self.supersample, int) and 1 <= self.supersample <= 16,
+            self.supersample in range(1, 17),
             f"ShotCfg.supersample = {self.supersample!r}: must be a whole number in 1..16",
         )
 
@@ -87,16 +98,14 @@ def shoot(
     flat = np.linalg.inv(shift) @ flat @ shift
     levels = cfg.black + (cfg.white - cfg.black) / 255.0 * picture.astype(np.float32)
     canvas = np.full((k * height, k * width), cfg.surround, np.float32)
-    cv2.warpPerspective(
-        levels, flat, canvas.shape[::-1], canvas, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
-    )
+    cv2.warpPerspective(levels, flat, canvas.shape[::-1], canvas, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
     if hidden_by is not None:
         _cover(canvas, hidden_by, fine)
     if cfg.blur_px > 0:
-        canvas = cv2.GaussianBlur(canvas, (0, 0), k * cfg.blur_px)
-    image = canvas.reshape(height, k, width, k).mean(axis=(1, 3), dtype=np.float64)
+        cv2.GaussianBlur(canvas, (0, 0), k * cfg.blur_px, canvas)
+    image = np.asarray(canvas, np.float64).reshape(height, k, width, k).mean(axis=(1, 3))
     image += rng.normal(0.0, cfg.noise_sigma, image.shape)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
 
 
 def _cover(canvas: NDArray[np.float32], triangles: Array, matrix: Array) -> None:
@@ -107,3 +116,136 @@ def _cover(canvas: NDArray[np.float32], triangles: Array, matrix: Array) -> None
     corners = np.rint((p[before, :, :2] / p[before, :, 2:] - 0.5) * 16).astype(np.int32)
     for triangle in corners:
         cv2.fillConvexPoly(canvas, triangle, 0.0, lineType=cv2.LINE_8, shift=4)
+
+
+def print_frame(T_world_middle: Array, size_m: tuple[float, float]) -> Array:
+    """From a label's own frame to the one ``shoot`` counts from.
+
+    Args:
+        T_world_middle: Frame in the label's middle, x right, y up in its picture, z out of it; (4, 4), m.
+        size_m: Width and height [m].
+
+    Returns:
+        Frame at the upper left corner, x right, y down, z into the label, shape (4, 4), m.
+    """
+    corner = np.array([-size_m[0] / 2, size_m[1] / 2, 0.0])
+    return np.asarray(T_world_middle @ transform(np.diag([1.0, -1.0, -1.0]), corner))
+
+
+def part_marker(workpiece: Workpiece, cfg: MarkerCfg) -> PartMarker:
+    """The AR code of a part.
+
+    Args:
+        workpiece: The part.
+        cfg: Number and size.
+
+    Returns:
+        The code, in its place.
+
+    Raises:
+        SeamError: If the part has no room for it.
+    """
+    size_m = cfg.size_mm * 1e-3
+    unplaced = PartMarker(id=int(cfg.id), size_m=size_m, T_part_marker=np.eye(4))
+    return replace(unplaced, T_part_marker=marker_place(workpiece, unplaced.label_m))
+
+
+def marker_place(workpiece: Workpiece, label_m: float) -> Array:
+    """A place for a label on a part's plate: as far from the seam as can be, clear of all that stands there.
+
+    Of equally good places it takes the one farthest from the seam's start, where the gun waits.
+
+    Args:
+        workpiece: The part; its plate's top is the plane z = 0.
+        label_m: Side of the label [m].
+
+    Returns:
+        ``T_part_marker``: the label's middle, turned as the part is, shape (4, 4), m.
+
+    Raises:
+        SeamError: If no place on the plate is large enough.
+    """
+    triangles = workpiece.surface.triangles
+    low, high = triangles.reshape(-1, 3).min(axis=0)[:2], triangles.reshape(-1, 3).max(axis=0)[:2]
+    axes = [np.arange(a + _STEP_M / 2, b, _STEP_M) for a, b in zip(low, high, strict=True)]
+    x, y = np.meshgrid(*axes, indexing="ij")
+    cells = np.column_stack((x.ravel(), y.ravel()))
+    bare = (np.abs(_height(cells, triangles)) < _FLAT_M).reshape(x.shape).astype(np.uint8)
+    reach = int(np.ceil((label_m / 2 + _CLEAR_M) / _STEP_M))
+    window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    free = cells[cv2.erode(bare, window, borderType=cv2.BORDER_CONSTANT, borderValue=0).ravel() > 0]
+    require(
+        len(free) > 0,
+        f"workpiece {workpiece.name!r} has no place for a label of {label_m * 1e3:.0f} mm: make the code "
+        "smaller ([marker] size_mm in the cell file) or the plate larger",
+        SeamError,
+    )
+    seam = workpiece.seam.at(np.linspace(0.0, workpiece.seam.length, 200)).position[:, :2]
+    away = np.linalg.norm(free[:, None] - seam, axis=-1)
+    # Whole millimetres, so that places alike by symmetry are alike.
+    best = np.lexsort((away[:, 0], np.round(away.min(axis=1), 3)))[-1]
+    return transform(np.eye(3), np.array([*free[best], _PAPER_M]))
+
+
+def _height(points: Array, triangles: Array) -> Array:
+    """Height of the surface seen from above, -inf where there is none, shape (n,), m."""
+    out = np.full(len(points), -np.inf)
+    for a, b, c in triangles:
+        u, v = b - a, c - a
+        area = u[0] * v[1] - u[1] * v[0]
+        if abs(area) < 1e-12:
+            continue  # stands upright
+        d = points - a[:2]
+        s = (d[:, 0] * v[1] - d[:, 1] * v[0]) / area
+        t = (u[0] * d[:, 1] - u[1] * d[:, 0]) / area
+        inside = (s >= 0) & (t >= 0) & (s + t <= 1)
+        out[inside] = np.maximum(out[inside], a[2] + s[inside] * u[2] + t[inside] * v[2])
+    return out
+
+
+def add_label(
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    picture: Grey,
+    size_m: tuple[float, float],
+    T_body_label: Array,
+    group: int,
+) -> None:
+    """Glues a print to a body of a MuJoCo model: to be seen, not to be felt.
+
+    Args:
+        spec: The model.
+        body: What it is glued to.
+        name: Of geom, mesh, material and texture.
+        picture: The print, grey, shape (h, w).
+        size_m: Width and height [m].
+        T_body_label: The label's middle, x right and y up in its picture, z out of it, shape (4, 4), m.
+        group: Geom group.
+    """
+    texture = spec.add_texture(
+        name=name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=picture.shape[1],
+        height=picture.shape[0],
+        nchannel=3,
+    )
+    texture.data = np.repeat(picture[..., None], 3, axis=-1).tobytes()
+    look = spec.add_material(name=name, rgba=[_PAPER_GREY] * 3 + [1.0], specular=0.0, shininess=0.0)
+    look.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    half = np.array(size_m) / 2
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert = (_QUAD * [*half, 0.0]).astype(np.float32).ravel()
+    mesh.usertexcoord = _QUAD_UV.astype(np.float32).ravel()
+    mesh.userface = mesh.userfacetexcoord = np.array([0, 1, 2, 0, 2, 3], np.int32)
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=name,
+        pos=T_body_label[:3, 3],
+        quat=quat_from_matrix(T_body_label[:3, :3]),
+        group=group,
+        contype=0,
+        conaffinity=0,
+    )

@@ -38,6 +38,18 @@ class CalibrationError(SealGymError, ValueError):
     """The views do not determine the camera."""
 
 
+def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture without its colours.
+
+    Args:
+        image: Grey, shape (H, W), or RGB, shape (H, W, 3).
+
+    Returns:
+        Shape (H, W).
+    """
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Board:
     """A ChArUco board: a chessboard with an ArUco marker in each white square.
@@ -105,9 +117,9 @@ class Board:
         Returns:
             The corners; none (shape (0, ...)) where the board is not recognised.
         """
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        pixels, ids, _, _ = cv2.aruco.CharucoDetector(self._board).detectBoard(grey)
-        if ids is None or len(ids) == 0:
+        pixels, ids, _, _ = cv2.aruco.CharucoDetector(self._board).detectBoard(as_grey(image))
+        # With nothing found OpenCV gives None, whatever its types say.
+        if ids is None or len(ids) == 0:  # type: ignore[redundant-expr]
             return BoardCorners(np.empty((0, 3)), np.empty((0, 2)))
         where = np.asarray(pixels, np.float64).reshape(-1, 2) + HALF_PIXEL
         return BoardCorners(self.corners_m[np.asarray(ids).ravel()], where)
@@ -264,7 +276,8 @@ def _zhang(frame_px: tuple[int, int], views: Sequence[BoardCorners]) -> tuple[fl
         flags=_PINHOLE,
     )
     rotations = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
-    return float(matrix[0, 0]), matrix[:2, 2].copy(), transform(rotations, np.reshape(shifts, (-1, 3)))
+    K = np.asarray(matrix, dtype=np.float64)
+    return float(K[0, 0]), K[:2, 2], transform(rotations, np.reshape(shifts, (-1, 3)))
 
 
 def hand_eye(T_world_tip: Array, T_camera_board: Array) -> Array:
