@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from seal_gym.core.cell import MarkerCfg
+from seal_gym.core.cell import CameraCfg, MarkerCfg, OverheadCfg
 from seal_gym.core.errors import SeamError, is_number, require
 from seal_gym.core.frames import Array, quat_from_matrix, transform
+from seal_gym.vision.calibration import Board
 from seal_gym.vision.part_pose import PartMarker
 from seal_gym.workpieces.workpiece import Workpiece
 
@@ -17,6 +18,8 @@ Grey = NDArray[np.uint8]
 # A label's corners (times half its size), counter-clockwise from the lower left, and its texture's.
 _QUAD = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 _QUAD_UV = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+# Resolution of the prints.
+_SQUARE_PX, _BIT_PX = 96, 48
 # Above the plate, so that the two do not flicker through each other.
 _PAPER_M = 1e-4
 # Reflectance of white paper; more, and the lamps of the scene drive it into the sensor's limit.
@@ -118,18 +121,71 @@ def _cover(canvas: NDArray[np.float32], triangles: Array, matrix: Array) -> None
         cv2.fillConvexPoly(canvas, triangle, 0.0, lineType=cv2.LINE_8, shift=4)
 
 
-def print_frame(T_world_middle: Array, size_m: tuple[float, float]) -> Array:
-    """From a label's own frame to the one ``shoot`` counts from.
+def shoot_board(
+    board: Board,
+    T_world_board: Array,
+    camera: CameraCfg,
+    T_world_tip: Array,
+    tool: Array,
+    rng: np.random.Generator,
+    cfg: ShotCfg,
+) -> Grey:
+    """A sensor camera's picture of a calibration board, the nozzle before it.
 
     Args:
-        T_world_middle: Frame in the label's middle, x right, y up in its picture, z out of it; (4, 4), m.
-        size_m: Width and height [m].
+        board: The board.
+        T_world_board: Its place, shape (4, 4), m.
+        camera: The camera; its ROI is the picture (``CameraCfg.window`` gives the whole frame).
+        T_world_tip: The tip's pose, shape (4, 4), m.
+        tool: Triangles of the nozzle in the tip frame (``Scene.tool``), shape (n, 3, 3), m.
+        rng: Source of the noise.
+        cfg: Light, blur and noise.
 
     Returns:
-        Frame at the upper left corner, x right, y down, z into the label, shape (4, 4), m.
+        Shape (height, width).
     """
-    corner = np.array([-size_m[0] / 2, size_m[1] / 2, 0.0])
-    return np.asarray(T_world_middle @ transform(np.diag([1.0, -1.0, -1.0]), corner))
+    T_camera_tip = np.linalg.inv(transform(camera.rotation, camera.position_m))
+    matrix = np.diag([camera.focal_px, camera.focal_px, 1.0])
+    matrix[:2, 2] = camera.centre_px
+    return shoot(
+        board.picture(_SQUARE_PX),
+        board.size_m,
+        T_camera_tip @ np.linalg.inv(T_world_tip) @ T_world_board,
+        matrix,
+        camera.roi_px,
+        rng,
+        cfg,
+        tool @ T_camera_tip[:3, :3].T + T_camera_tip[:3, 3],
+    )
+
+
+def shoot_marker(
+    marker: PartMarker, T_world_part: Array, camera: OverheadCfg, rng: np.random.Generator, cfg: ShotCfg
+) -> Grey:
+    """The overhead camera's picture of a part's AR code, nothing before it.
+
+    Args:
+        marker: The code.
+        T_world_part: The part's pose, shape (4, 4), m.
+        camera: The camera.
+        rng: Source of the noise.
+        cfg: Light, blur and noise.
+
+    Returns:
+        Shape (height, width).
+    """
+    half = marker.label_m / 2
+    # From the middle, y up and z out of the label, to its upper left corner, y down and z into it.
+    T_marker_print = transform(np.diag([1.0, -1.0, -1.0]), np.array([-half, half, 0.0]))
+    return shoot(
+        marker.picture(_BIT_PX),
+        (marker.label_m, marker.label_m),
+        np.linalg.inv(camera.pose) @ T_world_part @ marker.T_part_marker @ T_marker_print,
+        camera.matrix,
+        camera.frame_px,
+        rng,
+        cfg,
+    )
 
 
 def part_marker(workpiece: Workpiece, cfg: MarkerCfg) -> PartMarker:

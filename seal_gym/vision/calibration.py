@@ -2,7 +2,8 @@
 
 Found are focal length, principal point and mount (hand-eye) of a pinhole camera without distortion, and the
 board's place. Start values: Zhang's method (``cv2.calibrateCamera``) and Park and Martin's hand-eye solution;
-then one least squares over all of them, in which the known tip poses hold the views together.
+then one least squares over all of them, in which the known tip poses hold the views together, each free to
+deviate as much as an arm's do.
 """
 
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ HALF_PIXEL = 0.5
 _DICTIONARY = cv2.aruco.DICT_4X4_1000
 # Rotations between the views must differ in axis: the sine below which they count as one axis.
 _MIN_SPREAD = 0.05
+# Values that all views share: focal length, principal point, mount, board.
+_SHARED = 15
 _PINHOLE = (
     cv2.CALIB_FIX_ASPECT_RATIO
     | cv2.CALIB_ZERO_TANGENT_DIST
@@ -144,13 +147,19 @@ class SolveCfg:
     Attributes:
         min_views: Least number of pictures that show the board.
         min_corners: Pictures with fewer corners are left out.
+        corner_px: Standard deviation of a corner's coordinate [px].
         outlier_px: Scale beyond which a corner's error counts less (soft L1): the nozzle hides parts of
             squares, and what is left can look like a corner.
+        tip_mm: Standard deviation of a tip pose's position, along each axis [mm]; a UR5 repeats to 0.1 mm.
+        tip_deg: Standard deviation of a tip pose's rotation, about each axis [deg].
     """
 
     min_views: int = 5
     min_corners: int = 8
+    corner_px: float = 0.1
     outlier_px: float = 0.3
+    tip_mm: float = 0.05
+    tip_deg: float = 0.02
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
@@ -160,10 +169,11 @@ class SolveCfg:
                 is_number(value) and int(value) == value and value >= low,
                 f"SolveCfg.{name} = {value!r}: must be a whole number >= {low}",
             )
-        require(
-            is_number(self.outlier_px) and self.outlier_px > 0,
-            f"SolveCfg.outlier_px = {self.outlier_px!r}: must be a finite number > 0",
-        )
+        for name in ("corner_px", "outlier_px", "tip_mm", "tip_deg"):
+            value = getattr(self, name)
+            require(
+                is_number(value) and value > 0, f"SolveCfg.{name} = {value!r}: must be a finite number > 0"
+            )
 
 
 class Calibration(NamedTuple):
@@ -172,16 +182,14 @@ class Calibration(NamedTuple):
     Attributes:
         camera: Intrinsics and mount; its ROI is the calibrated frame (``CameraCfg.window`` gives the ROI).
         T_world_board: The board's place, shape (4, 4), m.
-        residual_px: Root mean square distance from the corners found to those predicted [px].
+        errors_px: Predicted minus found corners of the pictures used, shape (n, 2), px.
         views: Number of pictures used.
-        corners: Number of corners used.
     """
 
     camera: CameraCfg
     T_world_board: Array
-    residual_px: float
+    errors_px: Array
     views: int
-    corners: int
 
 
 def camera_cfg(
@@ -250,18 +258,22 @@ def calibrate(
     tips, views = np.asarray(T_world_tip, np.float64)[used], [seen[k] for k in used]
     focal, centre, T_camera_board = _zhang(frame_px, views)
     T_tip_camera = hand_eye(tips, T_camera_board)
+    problem = _Problem(tips, views, cfg)
     start = _pack(focal, centre, T_tip_camera, tips[0] @ T_tip_camera @ T_camera_board[0])
     fit = least_squares(
-        _residuals, start, args=(tips, views), x_scale="jac", loss="soft_l1", f_scale=cfg.outlier_px
+        problem.residuals,
+        np.concatenate((start, np.zeros(6 * len(views)))),
+        jac_sparsity=problem.sparsity(),
+        x_scale=problem.scale(),
+        loss="soft_l1",
+        f_scale=cfg.outlier_px / cfg.corner_px,
     )
     focal, centre, T_tip_camera, T_world_board = _unpack(fit.x)
-    errors = _residuals(fit.x, tips, views).reshape(-1, 2)
     return Calibration(
         camera=camera_cfg(name, frame_px, focal, centre, T_tip_camera),
         T_world_board=T_world_board,
-        residual_px=float(np.sqrt((errors**2).sum(axis=1).mean())),
+        errors_px=problem.errors_px(fit.x).reshape(-1, 2),
         views=len(views),
-        corners=len(errors),
     )
 
 
@@ -315,8 +327,7 @@ def hand_eye(T_world_tip: Array, T_camera_board: Array) -> Array:
 
 def _pack(focal: float, centre: Array, T_tip_camera: Array, T_world_board: Array) -> Array:
     """Focal length and principal point, px; rotation vector and position of mount and board, rad and m."""
-    poses = (T_tip_camera, T_world_board)
-    six = [(Rotation.from_matrix(t[:3, :3]).as_rotvec(), t[:3, 3]) for t in poses]
+    six = [(Rotation.from_matrix(t[:3, :3]).as_rotvec(), t[:3, 3]) for t in (T_tip_camera, T_world_board)]
     return np.concatenate(([focal], centre, *six[0], *six[1]))
 
 
@@ -327,12 +338,38 @@ def _unpack(x: Array) -> tuple[float, Array, Array, Array]:
     return float(x[0]), x[1:3], mount, board
 
 
-def _residuals(x: Array, tips: Array, views: Sequence[BoardCorners]) -> Array:
-    """Predicted minus found corners of all views, flat, px."""
-    focal, centre, mount, board = _unpack(x)
-    T_camera_board = np.linalg.inv(tips @ mount) @ board
-    out = []
-    for pose, view in zip(T_camera_board, views, strict=True):
-        p = view.points_m @ pose[:3, :3].T + pose[:3, 3]
-        out.append((centre + focal * p[:, :2] / p[:, 2:] - view.pixels).ravel())
-    return np.concatenate(out)
+class _Problem(NamedTuple):
+    """The least squares: 15 values of ``_pack``, then each tip pose's deviation in sigmas, turn and shift."""
+
+    tips: Array
+    views: Sequence[BoardCorners]
+    cfg: SolveCfg
+
+    def residuals(self, x: Array) -> Array:
+        """Everything in standard deviations."""
+        return np.concatenate((self.errors_px(x) / self.cfg.corner_px, x[_SHARED:]))
+
+    def errors_px(self, x: Array) -> Array:
+        """Predicted minus found corners of all views, flat, px."""
+        focal, centre, mount, board = _unpack(x)
+        off = x[_SHARED:].reshape(-1, 6)
+        turn = Rotation.from_rotvec(np.deg2rad(self.cfg.tip_deg) * off[:, :3]).as_matrix()
+        tips = self.tips @ transform(turn, 1e-3 * self.cfg.tip_mm * off[:, 3:])
+        out = []
+        for pose, view in zip(np.linalg.inv(tips @ mount) @ board, self.views, strict=True):
+            p = view.points_m @ pose[:3, :3].T + pose[:3, 3]
+            out.append((centre + focal * p[:, :2] / p[:, 2:] - view.pixels).ravel())
+        return np.concatenate(out)
+
+    def sparsity(self) -> NDArray[np.int8]:
+        """Which residual depends on which value: a view's corners on its own deviation only."""
+        view = np.repeat(np.arange(len(self.views)), [v.pixels.size for v in self.views])
+        own = np.repeat(np.arange(len(self.views)), 6)
+        corners = np.hstack((np.ones((len(view), _SHARED)), view[:, None] == own))
+        priors = np.hstack((np.zeros((len(own), _SHARED)), np.eye(len(own))))
+        return np.vstack((corners, priors)).astype(np.int8)
+
+    def scale(self) -> Array:
+        """How far each value may move in a step: pixels, hundredths of rad, millimetres, sigmas."""
+        pose = [1e-2] * 3 + [1e-3] * 3
+        return np.array([1.0, 1.0, 1.0, *pose, *pose, *[1.0] * (6 * len(self.views))])
