@@ -92,23 +92,48 @@ def shoot(
         Shape (height, width).
     """
     width, height = frame_px
+    flat = matrix @ np.column_stack((T_camera_print[:3, :2], T_camera_print[:3, 3]))
+    flat = flat @ np.diag([size_m[0] / picture.shape[1], size_m[1] / picture.shape[0], 1.0])
+    image = np.full((height, width), cfg.surround)
+    rows, columns = _window(flat, picture, frame_px, hidden_by is not None, 4 * cfg.blur_px)
+    # Supersampled pixels of the window.
     k = cfg.supersample
-    # Both pictures' coordinates continuous; OpenCV's count from pixel centres, half a pixel less.
-    to_metres = np.diag([size_m[0] / picture.shape[1], size_m[1] / picture.shape[0], 1.0])
-    fine = np.diag([k, k, 1.0]) @ matrix
-    flat = fine @ np.column_stack((T_camera_print[:3, :2], T_camera_print[:3, 3])) @ to_metres
-    shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    flat = np.linalg.inv(shift) @ flat @ shift
+    fine = np.diag([k, k, 1.0]) @ np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1.0]])
+    canvas = np.full(
+        (k * (rows.stop - rows.start), k * (columns.stop - columns.start)), cfg.surround, np.float32
+    )
     levels = cfg.black + (cfg.white - cfg.black) / 255.0 * picture.astype(np.float32)
-    canvas = np.full((k * height, k * width), cfg.surround, np.float32)
-    cv2.warpPerspective(levels, flat, canvas.shape[::-1], canvas, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
+    # Our coordinates are continuous; OpenCV's count from pixel centres, half a pixel less.
+    shift = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    to_canvas = np.linalg.inv(shift) @ fine @ flat @ shift
+    cv2.warpPerspective(
+        levels, to_canvas, canvas.shape[::-1], canvas, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
+    )
     if hidden_by is not None:
-        _cover(canvas, hidden_by, fine)
+        _cover(canvas, hidden_by, fine @ matrix)
     if cfg.blur_px > 0:
         cv2.GaussianBlur(canvas, (0, 0), k * cfg.blur_px, canvas)
-    image = np.asarray(canvas, np.float64).reshape(height, k, width, k).mean(axis=(1, 3))
+    blocks = np.asarray(canvas, np.float64).reshape(canvas.shape[0] // k, k, canvas.shape[1] // k, k)
+    image[rows, columns] = blocks.mean(axis=(1, 3))
     image += rng.normal(0.0, cfg.noise_sigma, image.shape)
     return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
+
+
+def _window(
+    flat: Array, picture: Grey, frame_px: tuple[int, int], everything: bool, margin_px: float
+) -> tuple[slice, slice]:
+    """Rows and columns of the frame in which the print lies: all of them, if there is more to draw."""
+    width, height = frame_px
+    h, w = picture.shape
+    corners = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]]) @ flat.T
+    if everything or (corners[:, 2] <= 0).any():
+        return slice(0, height), slice(0, width)
+    pixels = corners[:, :2] / corners[:, 2:]
+    low, high = pixels.min(axis=0) - margin_px - 2, pixels.max(axis=0) + margin_px + 2
+    # At least one pixel, so that a print out of sight needs no case of its own.
+    x0, y0 = (int(v) for v in np.clip(low, 0, [width - 1, height - 1]))
+    x1, y1 = (int(v) for v in np.clip(np.ceil(high), [x0 + 1, y0 + 1], [width, height]))
+    return slice(y0, y1), slice(x0, x1)
 
 
 def _cover(canvas: NDArray[np.float32], triangles: Array, matrix: Array) -> None:
@@ -229,18 +254,24 @@ def marker_place(workpiece: Workpiece, label_m: float) -> Array:
     bare = (np.abs(_height(cells, triangles)) < _FLAT_M).reshape(x.shape).astype(np.uint8)
     reach = int(np.ceil((label_m / 2 + _CLEAR_M) / _STEP_M))
     window = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    free = cells[cv2.erode(bare, window, borderType=cv2.BORDER_CONSTANT, borderValue=0).ravel() > 0]
+    room = np.asarray(cv2.erode(bare, window, borderType=cv2.BORDER_CONSTANT, borderValue=0))
+    seam = workpiece.seam
+    # With its run-on: a groove may be narrower than the grid.
+    whole = seam.at(np.linspace(seam.arc[0], seam.arc[-1], 400)).position[:, :2]
+    away = np.linalg.norm(cells[:, None] - whole, axis=-1).min(axis=1)
+    free = (room.ravel() > 0) & (away > label_m / np.sqrt(2) + _CLEAR_M)
     require(
-        len(free) > 0,
+        bool(free.any()),
         f"workpiece {workpiece.name!r} has no place for a label of {label_m * 1e3:.0f} mm: make the code "
         "smaller ([marker] size_mm in the cell file) or the plate larger",
         SeamError,
     )
-    seam = workpiece.seam.at(np.linspace(0.0, workpiece.seam.length, 200)).position[:, :2]
-    away = np.linalg.norm(free[:, None] - seam, axis=-1)
+    free_cells = cells[free]
+    sealed = seam.at(np.linspace(0.0, seam.length, 200)).position[:, :2]
+    apart = np.linalg.norm(free_cells[:, None] - sealed, axis=-1)
     # Whole millimetres, so that places alike by symmetry are alike.
-    best = np.lexsort((away[:, 0], np.round(away.min(axis=1), 3)))[-1]
-    return transform(np.eye(3), np.array([*free[best], _PAPER_M]))
+    best = np.lexsort((apart[:, 0], np.round(apart.min(axis=1), 3)))[-1]
+    return transform(np.eye(3), np.array([*free_cells[best], _PAPER_M]))
 
 
 def _height(points: Array, triangles: Array) -> Array:
@@ -304,4 +335,5 @@ def add_label(
         group=group,
         contype=0,
         conaffinity=0,
+        density=0.0,
     )

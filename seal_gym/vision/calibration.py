@@ -258,13 +258,12 @@ def calibrate(
     tips, views = np.asarray(T_world_tip, np.float64)[used], [seen[k] for k in used]
     focal, centre, T_camera_board = _zhang(frame_px, views)
     T_tip_camera = hand_eye(tips, T_camera_board)
-    problem = _Problem(tips, views, cfg)
+    problem = _Problem.of(tips, views, cfg)
     start = _pack(focal, centre, T_tip_camera, tips[0] @ T_tip_camera @ T_camera_board[0])
     fit = least_squares(
         problem.residuals,
         np.concatenate((start, np.zeros(6 * len(views)))),
-        jac_sparsity=problem.sparsity(),
-        x_scale=problem.scale(),
+        x_scale="jac",
         loss="soft_l1",
         f_scale=cfg.outlier_px / cfg.corner_px,
     )
@@ -272,7 +271,7 @@ def calibrate(
     return Calibration(
         camera=camera_cfg(name, frame_px, focal, centre, T_tip_camera),
         T_world_board=T_world_board,
-        errors_px=problem.errors_px(fit.x).reshape(-1, 2),
+        errors_px=problem.errors_px(fit.x),
         views=len(views),
     )
 
@@ -339,37 +338,35 @@ def _unpack(x: Array) -> tuple[float, Array, Array, Array]:
 
 
 class _Problem(NamedTuple):
-    """The least squares: 15 values of ``_pack``, then each tip pose's deviation in sigmas, turn and shift."""
+    """The least squares: 15 values of ``_pack``, then each tip pose's deviation in sigmas, turn and shift.
+
+    Corners of all views lie one after another; ``view`` says whose each is.
+    """
 
     tips: Array
-    views: Sequence[BoardCorners]
+    points_m: Array
+    pixels: Array
+    view: NDArray[np.intp]
     cfg: SolveCfg
 
+    @classmethod
+    def of(cls, tips: Array, views: Sequence[BoardCorners], cfg: SolveCfg) -> Self:
+        """Puts the views one after another."""
+        points, pixels = (np.concatenate(rows) for rows in zip(*views, strict=True))
+        return cls(
+            tips, points, pixels, np.repeat(np.arange(len(views)), [len(v.pixels) for v in views]), cfg
+        )
+
     def residuals(self, x: Array) -> Array:
-        """Everything in standard deviations."""
-        return np.concatenate((self.errors_px(x) / self.cfg.corner_px, x[_SHARED:]))
+        """Everything in standard deviations, flat."""
+        return np.concatenate((self.errors_px(x).ravel() / self.cfg.corner_px, x[_SHARED:]))
 
     def errors_px(self, x: Array) -> Array:
-        """Predicted minus found corners of all views, flat, px."""
+        """Predicted minus found corners, shape (n, 2), px."""
         focal, centre, mount, board = _unpack(x)
         off = x[_SHARED:].reshape(-1, 6)
         turn = Rotation.from_rotvec(np.deg2rad(self.cfg.tip_deg) * off[:, :3]).as_matrix()
         tips = self.tips @ transform(turn, 1e-3 * self.cfg.tip_mm * off[:, 3:])
-        out = []
-        for pose, view in zip(np.linalg.inv(tips @ mount) @ board, self.views, strict=True):
-            p = view.points_m @ pose[:3, :3].T + pose[:3, 3]
-            out.append((centre + focal * p[:, :2] / p[:, 2:] - view.pixels).ravel())
-        return np.concatenate(out)
-
-    def sparsity(self) -> NDArray[np.int8]:
-        """Which residual depends on which value: a view's corners on its own deviation only."""
-        view = np.repeat(np.arange(len(self.views)), [v.pixels.size for v in self.views])
-        own = np.repeat(np.arange(len(self.views)), 6)
-        corners = np.hstack((np.ones((len(view), _SHARED)), view[:, None] == own))
-        priors = np.hstack((np.zeros((len(own), _SHARED)), np.eye(len(own))))
-        return np.vstack((corners, priors)).astype(np.int8)
-
-    def scale(self) -> Array:
-        """How far each value may move in a step: pixels, hundredths of rad, millimetres, sigmas."""
-        pose = [1e-2] * 3 + [1e-3] * 3
-        return np.array([1.0, 1.0, 1.0, *pose, *pose, *[1.0] * (6 * len(self.views))])
+        T_camera_board = (np.linalg.inv(tips @ mount) @ board)[self.view]
+        p = (T_camera_board[:, :3, :3] @ self.points_m[:, :, None])[..., 0] + T_camera_board[:, :3, 3]
+        return np.asarray(centre + focal * p[:, :2] / p[:, 2:] - self.pixels)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from seal_gym.core.cell import OverheadCfg
@@ -21,6 +22,8 @@ _DICTIONARY = cv2.aruco.DICT_4X4_50
 _BITS = 6  # four, and the black rim on both sides
 # Refinement of the code's sides: part of a side that is used, reach to both sides of it, samples across it.
 _SIDE, _REACH_BITS, _PROFILE, _REFINEMENTS = (0.08, 0.92), 0.45, 24, 3
+# Neighbours along a side that share their levels of white and black.
+_SMOOTH = 9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,9 +135,11 @@ def _side(grey: NDArray[np.uint8], start: Array, end: Array) -> Array:
     seen = cv2.remap(source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     profile = np.asarray(seen, dtype=np.float64)
     rim = _PROFILE // 4
-    # White place by place: the edge of a shadow may lie across the margin.
-    white, black = profile[:, :rim].mean(axis=1), np.median(profile[:, -rim:])
-    edge = -half + (profile - black).mean(axis=1) * 2 * half / np.maximum(white - black, 1.0)
+    # Levels place by place: the edge of a shadow may lie across the side.
+    white, black = (
+        median_filter(p.mean(axis=1), _SMOOTH, mode="nearest") for p in (profile[:, :rim], profile[:, -rim:])
+    )
+    edge = -half + (profile.mean(axis=1) - black) * 2 * half / np.maximum(white - black, 1.0)
     slope, level = _line(share, edge)
     return np.asarray(np.stack([start + x * along + (level + slope * x) * inward for x in (0.0, 1.0)]))
 
@@ -183,17 +188,37 @@ def part_pose(corners_px: Array, marker: PartMarker, camera: OverheadCfg) -> Par
     Returns:
         The pose.
     """
-    points = marker.corners_m
-    _, turns, shifts, errors = cv2.solvePnPGeneric(
-        points, corners_px, camera.matrix, np.zeros(4), flags=cv2.SOLVEPNP_IPPE_SQUARE
+    points, undistorted = marker.corners_m, np.zeros(4)
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, corners_px, camera.matrix, undistorted, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    best = int(np.argmin(np.ravel(np.asarray(errors))))
-    turn, shift = cv2.solvePnPRefineLM(
-        points, corners_px, camera.matrix, np.zeros(4), turns[best].copy(), shifts[best].copy()
-    )
-    T_camera_marker = transform(cv2.Rodrigues(turn)[0].astype(np.float64), np.ravel(shift))
-    pose = camera.pose @ T_camera_marker @ np.linalg.inv(marker.T_part_marker)
-    return PartPose(pose, _rms(_errors(pose, corners_px, marker, camera)))
+    starts = [
+        *zip(map(np.ravel, turns), map(np.ravel, shifts), strict=True),
+        _facing(corners_px, marker, camera),
+    ]
+    poses = []
+    for start in starts:
+        if not np.isfinite(start).all():
+            continue  # a code that faces the camera squarely is a singular case of the method
+        rough_turn, rough_shift = (np.array(v, np.float64) for v in start)
+        turn, shift = cv2.solvePnPRefineLM(
+            points, corners_px, camera.matrix, undistorted, rough_turn, rough_shift
+        )
+        T_camera_marker = transform(cv2.Rodrigues(turn)[0].astype(np.float64), np.ravel(shift))
+        pose = camera.pose @ T_camera_marker @ np.linalg.inv(marker.T_part_marker)
+        poses.append(PartPose(pose, _rms(_errors(pose, corners_px, marker, camera))))
+    return min(poses, key=lambda p: p.residual_px)
+
+
+def _facing(corners_px: Array, marker: PartMarker, camera: OverheadCfg) -> tuple[Array, Array]:
+    """Rotation vector and position of a code that faces the camera, as large and turned as it is seen."""
+    top = corners_px[1] - corners_px[0]
+    side = np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=0), axis=1).mean()
+    depth = camera.focal_px * marker.size_m / side
+    ray = np.linalg.inv(camera.matrix) @ [*corners_px.mean(axis=0), 1.0]
+    # Half a turn about the axis in the picture's plane that bisects the code's x and the picture's.
+    half = 0.5 * np.arctan2(top[1], top[0])
+    return np.pi * np.array([np.cos(half), np.sin(half), 0.0]), depth * ray
 
 
 def level_part_pose(corners_px: Array, marker: PartMarker, camera: OverheadCfg, height_m: float) -> PartPose:

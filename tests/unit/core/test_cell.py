@@ -232,7 +232,9 @@ def test_cameras_that_are_no_sections_are_named(tmp_path, text):
 @pytest.mark.parametrize("camera", CELL.cameras, ids=lambda c: c.name)
 @pytest.mark.parametrize("size", [(640, 480), (641, 483), (24, 24), (1024, 8)])
 def test_a_window_is_the_same_camera_with_pixels_counted_from_another_corner(camera, size):
-    if not all(0 <= t + int((n - w) / 2) <= n for t, n, w in zip(camera.tip_px, size, camera.roi_px)):
+    if not all(
+        0 <= t + int((n - w) / 2) <= n for t, n, w in zip(camera.tip_px, size, camera.roi_px, strict=True)
+    ):
         with pytest.raises(ConfigError, match="must lie in the ROI"):
             camera.window(size)
         return
