@@ -28,6 +28,8 @@ _DICTIONARY = cv2.aruco.DICT_4X4_1000
 _MIN_SPREAD = 0.05
 # Values that all views share: focal length, principal point, mount, board.
 _SHARED = 15
+# Ten or so suffice; tip poses that contradict the pictures would take thousands.
+_MAX_STEPS = 60
 _PINHOLE = (
     cv2.CALIB_FIX_ASPECT_RATIO
     | cv2.CALIB_ZERO_TANGENT_DIST
@@ -266,6 +268,7 @@ def calibrate(
         x_scale="jac",
         loss="soft_l1",
         f_scale=cfg.outlier_px / cfg.corner_px,
+        max_nfev=_MAX_STEPS,
     )
     focal, centre, T_tip_camera, T_world_board = _unpack(fit.x)
     return Calibration(
