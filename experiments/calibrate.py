@@ -37,12 +37,12 @@ from seal_gym.sim.reach import check_reach  # noqa: E402
 from seal_gym.sim.scene import GROUP_COLLISION, Scene, build_scene, cached_scene  # noqa: E402
 from seal_gym.tasks.progress import SealTaskCfg  # noqa: E402
 from seal_gym.vision.calibration import Board, BoardCorners, Calibration, SolveCfg, calibrate  # noqa: E402
-from seal_gym.vision.part_pose import level_part_pose, part_pose  # noqa: E402
+from seal_gym.vision.part_pose import PartMarker, level_part_pose, part_pose  # noqa: E402
 from seal_gym.workpieces import catalogue  # noqa: E402
 
 mpl.use("Agg")  # no screen needed
 import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.patches import Rectangle  # noqa: E402
+from matplotlib.patches import Polygon, Rectangle  # noqa: E402
 
 Grey = NDArray[np.uint8]
 # The board's middle, on a block as high as a part's plate; the board faces up, its x away from the robot.
@@ -547,8 +547,14 @@ def picture(path: Path, trial: Trial, overhead: NDArray[np.uint8]) -> None:
     panel.set(xlabel="corner found to corner predicted [px]; 0.5: 0.5 or more", ylabel="corners")
     panel.set_title("what is left after the fit")
     panel.legend(fontsize=8)
-    axes[1, 2].imshow(overhead, cmap="gray", vmin=0, vmax=255)
+    height, width = overhead.shape[:2]
+    axes[1, 2].imshow(overhead, cmap="gray", vmin=0, vmax=255, extent=(0, width, height, 0))
     axes[1, 2].set_title("overhead camera: the AR code on the part")
+    marker = PartMarker(id=cell.marker.id, size_m=1e-3 * cell.marker.size_mm, T_part_marker=np.eye(4))
+    corners = marker.find(overhead)
+    if corners is not None:
+        axes[1, 2].add_patch(Polygon(corners, fill=False, ec=_RED, lw=2, label="AR code as found"))
+        axes[1, 2].legend(loc="lower left", fontsize=8)
     for panel in (*axes[:, 0], *axes[:, 1], axes[1, 2]):
         panel.set(xticks=[], yticks=[])
     figure.savefig(path, dpi=90)

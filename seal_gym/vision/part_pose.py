@@ -21,7 +21,7 @@ from seal_gym.vision.calibration import HALF_PIXEL, as_grey
 _DICTIONARY = cv2.aruco.DICT_4X4_50
 _BITS = 6  # four, and the black rim on both sides
 # Refinement of the code's sides: part of a side that is used, reach to both sides of it, samples across it.
-_SIDE, _REACH_BITS, _PROFILE, _REFINEMENTS = (0.08, 0.92), 0.45, 24, 3
+_SIDE, _REACH_BITS, _PROFILE, _REFINEMENTS = (0.08, 0.92), 0.33, 24, 3
 # Neighbours along a side that share their levels of white and black.
 _SMOOTH = 9
 
