@@ -564,7 +564,7 @@ def picture(path: Path, trial: Trial, overhead: NDArray[np.uint8]) -> None:
 def write(
     out: Path, trial: Trial, cameras: list[dict[str, Any]], parts: list[dict[str, Any]], text: str
 ) -> None:
-    """Writes ``calibrate.json``, ``calibrate.md`` and the calibrated ``cell.toml``.
+    """Writes ``calibrate.json``, ``calibrate.md`` and the calibrated cell file.
 
     Args:
         out: The folder.
@@ -593,7 +593,7 @@ def write(
     (out / "calibrate.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     (out / "calibrate.md").write_text(text + "\n", encoding="utf-8")
     old = asset("ur5_sealgun", "cell.toml").read_text(encoding="utf-8")
-    (out / "cell.toml").write_text(with_cameras(old, found), encoding="utf-8")
+    (out / "calibrate.cell.toml").write_text(with_cameras(old, found), encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> int:

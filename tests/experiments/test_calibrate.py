@@ -42,7 +42,7 @@ def test_true_found_and_error_are_written(out):
 
 
 def test_the_calibrated_cell_file_is_read(out):
-    found, true = load_cell(out / "cell.toml"), load_cell()
+    found, true = load_cell(out / "calibrate.cell.toml"), load_cell()
     document = json.loads((out / "calibrate.json").read_text(encoding="utf-8"))
     for camera, nominal in zip(found.cameras, true.cameras, strict=True):
         assert camera.roi_px == nominal.roi_px
