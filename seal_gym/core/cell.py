@@ -1,18 +1,22 @@
-"""The cell's calibration: process constants, sensor cameras, timing and limits, from one file."""
+"""The cell's calibration: process constants, cameras, markers, timing and limits, from one file."""
 
 import tomllib
-from dataclasses import dataclass, fields
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from seal_gym.core.errors import ConfigError, is_number, require
-from seal_gym.core.frames import Array, normalise
+from seal_gym.core.frames import Array, normalise, transform
 from seal_gym.core.paths import asset
 
 VIEWS = ("front", "side")
+OVERHEAD = "overhead"
+_MAX_PIXELS = 4096
+Vector = tuple[float, float, float]
 
 
 def _positive(cfg: Any, *names: str) -> None:
@@ -22,6 +26,49 @@ def _positive(cfg: Any, *names: str) -> None:
             is_number(value) and value > 0,
             f"{type(cfg).__name__}.{name} = {value!r}: must be a finite number > 0",
         )
+
+
+def _at_most(cfg: Any, **highest: float) -> None:
+    """Catches slips of the unit: 3 for 3 mm where metres are asked for."""
+    for name, high in highest.items():
+        value = getattr(cfg, name)
+        require(
+            value <= high,
+            f"{type(cfg).__name__}.{name} = {value!r}: must be at most {high:g}; check the unit",
+        )
+
+
+def _vectors(cfg: Any, **lengths: int) -> None:
+    for name, length in lengths.items():
+        value = getattr(cfg, name)
+        require(
+            isinstance(value, tuple) and len(value) == length and all(map(is_number, value)),
+            f"{type(cfg).__name__}.{name} = {value!r}: must be {length} finite numbers",
+        )
+
+
+def _whole_pair(cfg: Any, name: str, low: int, high: int) -> None:
+    _vectors(cfg, **{name: 2})
+    value = getattr(cfg, name)
+    require(
+        all(int(n) == n and low <= n <= high for n in value),
+        f"{type(cfg).__name__}.{name} = {value!r}: width and height must be whole numbers in {low}..{high}",
+    )
+
+
+def _check_gaze(cfg: Any) -> None:
+    forward = np.subtract(cfg.target_mm, cfg.position_mm)
+    require(
+        bool(np.linalg.norm(np.cross(forward, cfg.up)) > 1e-6),
+        f"{type(cfg).__name__}.up = {cfg.up!r}: must not be parallel to the optical axis {tuple(forward)!r}",
+    )
+
+
+def _look_at(position_mm: Vector, target_mm: Vector, up: Vector) -> Array:
+    """Rotation from the camera's frame (x right, y down, z forward) to the one it is mounted in."""
+    forward = normalise(np.subtract(target_mm, position_mm).astype(np.float64))
+    right = normalise(np.cross(forward, np.asarray(up, dtype=np.float64)))
+    return np.stack((right, np.cross(forward, right), forward), axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +88,7 @@ class ProcessCfg:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         _positive(self, *(f.name for f in fields(self)))
+        _at_most(self, stand_off_m=0.05, speed_m_s=1.0, mouth_radius_m=0.02)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,24 +119,17 @@ class CameraCfg:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         _positive(self, "focal_px")
-        for field, length in (("position_mm", 3), ("target_mm", 3), ("up", 3), ("roi_px", 2), ("tip_px", 2)):
-            value = getattr(self, field)
-            require(
-                isinstance(value, tuple) and len(value) == length and all(map(is_number, value)),
-                f"CameraCfg.{field} = {value!r}: must be {length} finite numbers",
-            )
-        require(
-            all(int(n) == n and 8 <= n <= 1024 for n in self.roi_px),
-            f"CameraCfg.roi_px = {self.roi_px!r}: width and height must be whole numbers in 8..1024",
-        )
+        _vectors(self, position_mm=3, target_mm=3, up=3, tip_px=2)
+        _whole_pair(self, "roi_px", 8, 1024)
+        _check_gaze(self)
         forward = np.subtract(self.target_mm, self.position_mm)
-        require(
-            bool(np.linalg.norm(np.cross(forward, self.up)) > 1e-6),
-            f"CameraCfg.up = {self.up!r}: must not be parallel to the optical axis {tuple(forward)!r}",
-        )
         require(
             bool(forward @ np.negative(self.position_mm) > 0),
             f"CameraCfg.position_mm = {self.position_mm!r}: the nozzle mouth is behind the camera",
+        )
+        require(
+            all(0.0 <= x <= n for x, n in zip(self.tip_px, self.roi_px, strict=True)),
+            f"CameraCfg.tip_px = {self.tip_px!r}: must lie in the ROI of {self.roi_px!r} pixels",
         )
 
     @property
@@ -109,9 +150,7 @@ class CameraCfg:
     @cached_property
     def rotation(self) -> Array:
         """``R_tip_camera``, shape (3, 3): columns are the camera's x, y, z axes in the tip frame."""
-        forward = normalise(np.subtract(self.target_mm, self.position_mm).astype(np.float64))
-        right = normalise(np.cross(forward, np.asarray(self.up, dtype=np.float64)))
-        return np.stack((right, np.cross(forward, right), forward), axis=-1)
+        return _look_at(self.position_mm, self.target_mm, self.up)
 
     @cached_property
     def centre_px(self) -> Array:
@@ -130,6 +169,112 @@ class CameraCfg:
         """
         p = (points_tip - self.position_m) @ self.rotation
         return np.asarray(self.centre_px + self.focal_px * p[..., :2] / p[..., 2:])
+
+    def window(self, size_px: tuple[int, int]) -> Self:
+        """The same camera read in a window of another size about the same middle.
+
+        Calibration reads the whole frame, the controller its ROI: focal length and mount are the same,
+        pixels count from another corner.
+
+        Args:
+            size_px: Width and height of the window [px].
+
+        Returns:
+            The camera with that window for an ROI.
+        """
+        # Truncation towards zero, so that a window and back again is where it was.
+        shift = [int((new - old) / 2) for new, old in zip(size_px, self.roi_px, strict=True)]
+        return replace(self, roi_px=size_px, tip_px=(self.tip_px[0] + shift[0], self.tip_px[1] + shift[1]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverheadCfg:
+    """A pinhole camera fixed above the cell, its principal point in the middle of its picture.
+
+    Camera frame and pixel coordinates are ``CameraCfg``'s.
+
+    Attributes:
+        position_mm: Optical centre in the world frame (the robot's base) [mm], 3 numbers.
+        target_mm: A point on the optical axis in the world frame [mm], 3 numbers.
+        up: Direction in the world frame that is up in the image, 3 numbers.
+        frame_px: Width and height of the picture [px].
+        focal_px: Focal length [px].
+    """
+
+    position_mm: Vector
+    target_mm: Vector
+    up: Vector
+    frame_px: tuple[int, int]
+    focal_px: float
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        _positive(self, "focal_px")
+        _vectors(self, position_mm=3, target_mm=3, up=3)
+        _whole_pair(self, "frame_px", 8, _MAX_PIXELS)
+        _check_gaze(self)
+
+    @cached_property
+    def pose(self) -> Array:
+        """``T_world_camera``, shape (4, 4), m."""
+        rotation = _look_at(self.position_mm, self.target_mm, self.up)
+        return transform(rotation, np.asarray(self.position_mm, np.float64) * 1e-3)
+
+    @cached_property
+    def matrix(self) -> Array:
+        """Intrinsic matrix for continuous pixel coordinates, shape (3, 3), px."""
+        width, height = self.frame_px
+        f = self.focal_px
+        return np.array([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationCfg:
+    """What the sensor cameras are calibrated with: their whole frame and a ChArUco board.
+
+    Attributes:
+        frame_px: Width and height of the sensor's frame, whose middle is the ROI's [px].
+        squares: Squares of the board in a row and in a column.
+        square_mm: Side of a square [mm].
+        marker_mm: Side of the ArUco marker in a white square [mm].
+    """
+
+    frame_px: tuple[int, int]
+    squares: tuple[int, int]
+    square_mm: float
+    marker_mm: float
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        _positive(self, "square_mm", "marker_mm")
+        _whole_pair(self, "frame_px", 8, 1024)
+        _whole_pair(self, "squares", 3, 20)
+        require(
+            self.marker_mm < self.square_mm,
+            f"CalibrationCfg.marker_mm = {self.marker_mm!r}: must be smaller than square_mm = "
+            f"{self.square_mm!r}",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerCfg:
+    """The AR code on a part, by which the overhead camera finds it.
+
+    Attributes:
+        id: Number of the code in OpenCV's dictionary 4X4_50, 0..49.
+        size_mm: Side of the code's black square [mm].
+    """
+
+    id: int
+    size_mm: float
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        _positive(self, "size_mm")
+        require(
+            is_number(self.id) and int(self.id) == self.id and 0 <= self.id < 50,
+            f"MarkerCfg.id = {self.id!r}: must be a whole number in 0..49",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,6 +335,9 @@ class CellCfg:
         process: Process constants.
         front: Forward-view camera.
         side: Side-view camera.
+        overhead: Camera above the cell, which sees the part's AR code.
+        calibration: What the sensor cameras are calibrated with.
+        marker: The part's AR code.
         timing: Rates.
         limits: Action limits.
     """
@@ -197,6 +345,9 @@ class CellCfg:
     process: ProcessCfg
     front: CameraCfg
     side: CameraCfg
+    overhead: OverheadCfg
+    calibration: CalibrationCfg
+    marker: MarkerCfg
     timing: TimingCfg
     limits: LimitsCfg
 
@@ -206,13 +357,13 @@ class CellCfg:
         return (self.front, self.side)
 
 
-def _build(cls: type[Any], table: dict[str, Any], where: str) -> Any:
+def _build(cls: type[Any], table: dict[str, Any], where: str, **given: str) -> Any:
     require(isinstance(table, dict), f"{where}: must be a section with keys, not {table!r}")
-    names = {f.name for f in fields(cls)}
+    names = {f.name for f in fields(cls)} - set(given)
     unknown, missing = sorted(set(table) - names), sorted(names - set(table))
     require(not unknown, f"{where}: unknown {unknown}; the keys are {sorted(names)}")
     require(not missing, f"{where}: {missing} missing; the keys are {sorted(names)}")
-    return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})
+    return cls(**given, **{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})
 
 
 @lru_cache(maxsize=8)
@@ -235,14 +386,67 @@ def load_cell(path: Path | None = None) -> CellCfg:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not valid TOML: {error}") from error
-    sections = {"process": ProcessCfg, "timing": TimingCfg, "limits": LimitsCfg}
+    sections = {
+        "process": ProcessCfg,
+        "calibration": CalibrationCfg,
+        "marker": MarkerCfg,
+        "timing": TimingCfg,
+        "limits": LimitsCfg,
+    }
     unknown = sorted(set(table) - {*sections, "camera"})
     require(not unknown, f"{path.name}: unknown {unknown}; the sections are {[*sections, 'camera']}")
     cameras = table.get("camera", {})
+    require(isinstance(cameras, dict), f"{path.name} [camera]: must be a section with keys, not {cameras!r}")
+    names = [*VIEWS, OVERHEAD]
+    unknown = sorted(set(cameras) - set(names))
+    require(not unknown, f"{path.name} [camera]: unknown {unknown}; the cameras are {names}")
     for section in sections:
         require(section in table, f"{path.name}: section [{section}] missing")
-    for view in VIEWS:
-        require(view in cameras, f"{path.name}: section [camera.{view}] missing")
+    for name in names:
+        require(name in cameras, f"{path.name}: section [camera.{name}] missing")
     parts = {k: _build(cls, table[k], f"{path.name} [{k}]") for k, cls in sections.items()}
-    views = {v: _build(CameraCfg, {"name": v, **cameras[v]}, f"{path.name} [camera.{v}]") for v in VIEWS}
-    return CellCfg(**parts, **views)
+    views = {v: _build(CameraCfg, cameras[v], f"{path.name} [camera.{v}]", name=v) for v in VIEWS}
+    overhead = _build(OverheadCfg, cameras[OVERHEAD], f"{path.name} [camera.{OVERHEAD}]")
+    return CellCfg(**parts, **views, overhead=overhead)
+
+
+def with_cameras(text: str, cameras: Iterable[CameraCfg]) -> str:
+    """A cell file with the values of sensor cameras replaced, comments and all else left alone.
+
+    Args:
+        text: The file's text; it holds a section ``[camera.<name>]`` for each camera.
+        cameras: The cameras to write, e.g. as calibrated.
+
+    Returns:
+        The new text.
+    """
+    values = {
+        f"[camera.{camera.name}]": {
+            f.name: getattr(camera, f.name) for f in fields(camera) if f.name != "name"
+        }
+        for camera in cameras
+    }
+    section, found = "", set()
+    out = []
+    for line in text.splitlines():
+        code = line.split("#")[0].strip()
+        if code.startswith("["):
+            section = code
+            found.add(section)
+        key = code.split("=")[0].strip()
+        new = values.get(section, {})
+        out.append(_with_value(line, key, new[key]) if key in new else line)
+    missing = sorted(set(values) - found)
+    require(not missing, f"the cell file has no section {missing}: add it, or calibrate the cameras it has")
+    return "\n".join(out) + "\n"
+
+
+def _with_value(line: str, key: str, value: Any) -> str:
+    """A line of a cell file with another value and its old comment."""
+    _, mark, comment = line.partition("#")
+    return f"{key} = {_toml(value)}".ljust(26 if mark else 0) + (f" #{comment}" if mark else "")
+
+
+def _toml(value: Any) -> str:
+    """A number or a tuple of numbers in TOML, to the last bit."""
+    return f"[{', '.join(map(_toml, value))}]" if isinstance(value, tuple) else repr(value)

@@ -6,12 +6,13 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 
-from seal_gym.core.cell import CellCfg
+from seal_gym.core.cell import OVERHEAD, CellCfg
 from seal_gym.core.errors import PhysicsError
 from seal_gym.core.frames import Array, quat_from_matrix
 from seal_gym.core.kinematics import T_TOOL0_TIP
 from seal_gym.core.paths import asset
-from seal_gym.sim import texture
+from seal_gym.sim import markers, texture
+from seal_gym.vision.part_pose import PartMarker
 from seal_gym.workpieces.solids import Solid
 from seal_gym.workpieces.surface import MATERIALS
 from seal_gym.workpieces.workpiece import PLATE_THICKNESS_M, Workpiece
@@ -37,12 +38,14 @@ class Scene:
         workpiece: The part in it.
         cell: The cell it was built for.
         tool: Triangles of the nozzle in the tip frame, shape (m, 3, 3), m: the gun as its cameras see it.
+        marker: The AR code on the part, if there is one.
     """
 
     model: mujoco.MjModel
     workpiece: Workpiece
     cell: CellCfg
     tool: Array
+    marker: PartMarker | None = None
 
 
 def _add_furniture(spec: mujoco.MjSpec) -> None:
@@ -208,6 +211,25 @@ def _add_part(spec: mujoco.MjSpec, workpiece: Workpiece) -> None:
         _add_solid(part, spec, k, solid)
 
 
+def _add_marker(spec: mujoco.MjSpec, workpiece: Workpiece, cell: CellCfg) -> PartMarker:
+    """The part's AR code and the camera above the cell that reads it."""
+    marker = markers.part_marker(workpiece, cell.marker)
+    size = (marker.label_m, marker.label_m)
+    markers.add_label(
+        spec, spec.body("part"), "marker", marker.picture(16), size, marker.T_part_marker, GROUP_PART
+    )
+    camera = cell.overhead
+    element = spec.worldbody.add_camera(
+        name=OVERHEAD,
+        pos=camera.pose[:3, 3],
+        quat=quat_from_matrix(camera.pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])),
+        resolution=list(camera.frame_px),
+        focal_pixel=[camera.focal_px] * 2,
+    )
+    element.sensor_size = np.array(camera.frame_px) * 1e-5
+    return marker
+
+
 def _tool_triangles(model: mujoco.MjModel) -> Array:
     """The nozzle's triangles in the tip frame, from the compiled model."""
     geom = model.geom(GUN_PREFIX + "col_nozzle").id
@@ -223,7 +245,7 @@ def _tool_triangles(model: mujoco.MjModel) -> Array:
     return np.asarray(tip[model.mesh_face[face : face + int(model.mesh_facenum[mesh])]])
 
 
-def build_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
+def build_scene(workpiece: Workpiece, cell: CellCfg, *, marked: bool = False) -> Scene:
     """Composes and compiles the cell.
 
     World frame: the robot's DH base frame, z up. The part is a mocap body, so that it can be displaced
@@ -232,12 +254,14 @@ def build_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
     Args:
         workpiece: The part.
         cell: Cameras, timing and limits.
+        marked: With the AR code on the part and the overhead camera; they are seen, never felt.
 
     Returns:
         The scene.
 
     Raises:
         PhysicsError: If MuJoCo does not accept the part's geometry.
+        SeamError: If the part has no room for the AR code.
     """
     spec = mujoco.MjSpec.from_file(str(asset("ur5_sealgun", "ur5.xml")))
     gun = mujoco.MjSpec.from_file(str(asset("ur5_sealgun", "sealgun.xml")))
@@ -246,11 +270,12 @@ def build_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
     _add_furniture(spec)
     _add_sensor_cameras(spec.body(GUN_PREFIX + "sealgun"), cell)
     _add_part(spec, workpiece)
+    marker = _add_marker(spec, workpiece, cell) if marked else None
     try:
         model = spec.compile()
     except ValueError as error:
         raise PhysicsError(f"workpiece {workpiece.name!r} cannot be simulated: {error}") from error
-    return Scene(model=model, workpiece=workpiece, cell=cell, tool=_tool_triangles(model))
+    return Scene(model=model, workpiece=workpiece, cell=cell, tool=_tool_triangles(model), marker=marker)
 
 
 @lru_cache(maxsize=16)

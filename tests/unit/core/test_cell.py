@@ -7,7 +7,18 @@ import cv2
 import numpy as np
 import pytest
 
-from seal_gym.core.cell import CameraCfg, CellCfg, LimitsCfg, ProcessCfg, TimingCfg, load_cell
+from seal_gym.core.cell import (
+    CalibrationCfg,
+    CameraCfg,
+    CellCfg,
+    LimitsCfg,
+    MarkerCfg,
+    OverheadCfg,
+    ProcessCfg,
+    TimingCfg,
+    load_cell,
+    with_cameras,
+)
 from seal_gym.core.errors import ConfigError
 from seal_gym.core.paths import asset
 
@@ -61,7 +72,7 @@ def test_an_unknown_key_is_named(tmp_path, section):
         load(tmp_path, TEXT.replace(f"[{section}]", f"[{section}]\ncolour = 1 #"))
 
 
-@pytest.mark.parametrize("section", ["process", "timing", "limits", "camera.front", "camera.side"])
+@pytest.mark.parametrize("section", sorted({s for s, _, _ in keys()}))
 def test_a_missing_section_is_named(tmp_path, section):
     lines, keep = [], True
     for line in TEXT.splitlines():
@@ -72,7 +83,7 @@ def test_a_missing_section_is_named(tmp_path, section):
         load(tmp_path, "\n".join(lines))
 
 
-SCALARS = [(s, k) for s, k, v in keys() if not isinstance(v, list)]
+SCALARS = [(s, k) for s, k, v in keys() if not isinstance(v, list) and (s, k) != ("marker", "id")]
 VECTORS = [(s, k, v) for s, k, v in keys() if isinstance(v, list)]
 
 
@@ -87,7 +98,8 @@ def test_a_scalar_out_of_range_is_named(tmp_path, section, key, bad):
 @pytest.mark.parametrize(("section", "key", "value"), VECTORS)
 def test_a_vector_of_wrong_length_or_not_finite_is_named(tmp_path, section, key, value, bad):
     wrong = value[:-1] if bad == "short" else [float("nan"), *value[1:]]
-    with pytest.raises(ConfigError, match=rf"CameraCfg\.{key} = .*must be {len(value)} finite numbers"):
+    cfg = {"calibration": "CalibrationCfg", "camera.overhead": "OverheadCfg"}.get(section, "CameraCfg")
+    with pytest.raises(ConfigError, match=rf"^{cfg}\.{key} = .*must be {len(value)} finite numbers"):
         load(tmp_path, with_value(section, key, str(wrong)))
 
 
@@ -100,6 +112,19 @@ def test_a_vector_of_wrong_length_or_not_finite_is_named(tmp_path, section, key,
         ("camera.side", "roi_px", "[100.5, 50]", "whole numbers"),
         ("camera.front", "up", "[0.0, 47.0, 98.0]", "parallel"),
         ("camera.front", "target_mm", "[0.0, 110.0, 193.0]", "behind the camera"),
+        ("camera.front", "tip_px", "[25.0, 101.0]", r"must lie in the ROI of \(50, 100\) pixels"),
+        ("camera.side", "tip_px", "[-1.0, 20.0]", r"must lie in the ROI of \(100, 50\) pixels"),
+        ("camera.overhead", "up", "[0.0, 0.0, 2.0]", "parallel"),
+        ("camera.overhead", "frame_px", "[1280, 9600]", r"OverheadCfg\.frame_px.*8\.\.4096"),
+        ("calibration", "frame_px", "[640.5, 480]", r"CalibrationCfg\.frame_px.*whole numbers in 8\.\.1024"),
+        ("calibration", "squares", "[2, 7]", r"3\.\.20"),
+        ("calibration", "marker_mm", "12.0", r"smaller than square_mm = 12\.0"),
+        ("marker", "id", "50", r"id = 50: must be a whole number in 0\.\.49"),
+        ("marker", "id", "-1", r"0\.\.49"),
+        ("marker", "id", "1.5", "whole number"),
+        ("process", "stand_off_m", "3", r"stand_off_m = 3: must be at most 0\.05; check the unit"),
+        ("process", "speed_m_s", "10.0", r"speed_m_s = 10\.0: must be at most 1; check the unit"),
+        ("process", "mouth_radius_m", "1.5", "at most 0.02; check the unit"),
     ],
 )
 def test_other_impossible_values_are_named(tmp_path, section, key, value, message):
@@ -120,7 +145,10 @@ def test_a_changed_value_arrives(tmp_path):
     assert dataclasses.replace(cell, process=CELL.process) == CELL
 
 
-@pytest.mark.parametrize("cls", [CellCfg, CameraCfg, LimitsCfg, ProcessCfg, TimingCfg])
+CONFIGS = [CalibrationCfg, CameraCfg, CellCfg, LimitsCfg, MarkerCfg, OverheadCfg, ProcessCfg, TimingCfg]
+
+
+@pytest.mark.parametrize("cls", CONFIGS)
 def test_configs_are_frozen(cls):
     assert cls.__dataclass_params__.frozen
 
@@ -180,6 +208,9 @@ def test_what_is_up_and_right_in_the_images():
         ("focal_px = 400.0", "focal_px = true", r"focal_px = True"),
         ("up = [0.0, 1.0, 0.0]", "up = 1.0", r"up = 1\.0: must be 3 finite numbers"),
         ("[process]", "[robot]\nname = 'x'\n[process]", r"unknown \['robot'\]; the sections are"),
+        ("[camera.side]", "[camera.rear]\nup = [0]\n[camera.side]", r"unknown \['rear'\]; the cameras are"),
+        ("[camera.front] ", "[camera.front]\nname = 'left' #", r"\[camera.front\]: unknown \['name'\]"),
+        ("[process]", "[process]\nflow = 1", r"\[process\]: unknown \['flow'\]"),
     ],
 )
 def test_wrong_types_and_sections_are_named(tmp_path, old, new, message):
@@ -189,3 +220,74 @@ def test_wrong_types_and_sections_are_named(tmp_path, old, new, message):
     path.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
         load_cell(path)
+
+
+@pytest.mark.parametrize("text", ["camera = 3", "[camera]\nfront = 3\nside = 3\noverhead = 3"])
+def test_cameras_that_are_no_sections_are_named(tmp_path, text):
+    rest = [part for part in TEXT.split("\n\n") if not part.startswith("[camera")]
+    with pytest.raises(ConfigError, match="must be a section with keys, not 3"):
+        load(tmp_path, text + "\n" + "\n\n".join(rest))
+
+
+@pytest.mark.parametrize("camera", CELL.cameras, ids=lambda c: c.name)
+@pytest.mark.parametrize("size", [(640, 480), (641, 483), (24, 24), (1024, 8)])
+def test_a_window_is_the_same_camera_with_pixels_counted_from_another_corner(camera, size):
+    if not all(
+        0 <= t + int((n - w) / 2) <= n for t, n, w in zip(camera.tip_px, size, camera.roi_px, strict=True)
+    ):
+        with pytest.raises(ConfigError, match="must lie in the ROI"):
+            camera.window(size)
+        return
+    wide = camera.window(size)
+    points = np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
+    shift = wide.project(points) - camera.project(points)
+    corner = [int((n - w) / 2) for n, w in zip(size, camera.roi_px, strict=True)]
+    np.testing.assert_allclose(shift, np.tile(corner, (50, 1)), atol=1e-9)
+    assert (wide.width, wide.height) == size
+    assert wide.window(camera.roi_px) == camera
+
+
+def test_the_whole_frame_holds_the_roi_in_its_middle():
+    for camera in CELL.cameras:
+        wide = camera.window(CELL.calibration.frame_px)
+        left_top = np.subtract(wide.tip_px, camera.tip_px)
+        right_bottom = np.subtract(wide.roi_px, left_top + camera.roi_px)
+        assert (left_top > 100).all() and (np.abs(left_top - right_bottom) <= 1).all()
+
+
+def test_the_overhead_camera_looks_down_with_up_away_from_the_robot():
+    camera = CELL.overhead
+    seen = [np.linalg.inv(camera.pose) @ [*p, 1.0] for p in ((0.43, 0.0, -0.05), (0.53, -0.2, -0.05))]
+    pixels = [camera.matrix @ p[:3] / p[2] for p in seen]
+    np.testing.assert_allclose(pixels[0][:2], [640, 480], atol=1e-9)
+    # 0.1 m away from the robot and 0.2 m to its right, 1 m below: 180 px up and 360 px to the right.
+    np.testing.assert_allclose(pixels[1][:2], [640 + 360, 480 - 180], atol=1e-9)
+    assert np.linalg.det(camera.pose[:3, :3]) == pytest.approx(1.0)
+
+
+def test_cameras_are_written_into_the_file_and_read_back_to_the_bit(tmp_path):
+    rng = np.random.default_rng(3)
+    new = [
+        dataclasses.replace(
+            camera,
+            position_mm=tuple(map(float, camera.position_mm + rng.normal(0, 1, 3))),
+            target_mm=tuple(map(float, camera.target_mm + rng.normal(0, 1, 3))),
+            up=tuple(map(float, camera.up + rng.normal(0, 0.1, 3))),
+            focal_px=float(camera.focal_px + rng.normal()),
+            tip_px=tuple(map(float, camera.tip_px + rng.normal(0, 1, 2))),
+        )
+        for camera in CELL.cameras
+    ]
+    text = with_cameras(TEXT, new)
+    assert load(tmp_path, text) == dataclasses.replace(CELL, front=new[0], side=new[1])
+    comments = [[line.split("#")[1] for line in t.splitlines() if "#" in line] for t in (TEXT, text)]
+    assert comments[0] == comments[1]
+    assert with_cameras(text, CELL.cameras) == with_cameras(TEXT, CELL.cameras)
+    only = load(tmp_path, with_cameras(TEXT, new[1:]))
+    assert (only.front, only.side) == (CELL.front, new[1])
+
+
+def test_a_camera_the_file_does_not_have_is_named():
+    stranger = dataclasses.replace(CELL.front, name="rear")
+    with pytest.raises(ConfigError, match=r"no section \['\[camera.rear\]'\]"):
+        with_cameras(TEXT, [stranger])
