@@ -41,7 +41,7 @@ SETTLED_M = 10e-3  # the approach from the hover is not measured
 WARM_UP_M = 10e-3
 _END_M = 2e-3
 # Edge methods that the tracker with a memory is run on.
-MEMORY = ("ours",)
+MEMORY = tuple(DETECTORS)
 # Chosen on validation seeds with our edges; the best for each edge method is within a few per cent of this.
 KALMAN = {"raw": LineKalmanCfg(), "refined": LineKalmanCfg(q=8.0)}
 
@@ -247,8 +247,8 @@ def _filtered(line: Array, valid: Bools, cfg: LineKalmanCfg) -> tuple[Array, Boo
     return np.concatenate([o.line for o in out]), np.concatenate([o.valid for o in out])
 
 
-def _remembered(film: Film) -> SeamLines:
-    eyes = Perception(1, _views(), film.nozzle, load_cell().timing.frame_s)
+def _remembered(film: Film, edge: str) -> SeamLines:
+    eyes = Perception(1, _views(), film.nozzle, load_cell().timing.frame_s, detector=DETECTORS[edge]())
     out = [
         eyes.update(film.front[k : k + 1], film.side[k : k + 1], film.tip[k : k + 1])
         for k in range(len(film.front))
@@ -272,7 +272,7 @@ def read(film: Film, methods: list[Method]) -> dict[str, Array]:
         kind = "refined" if method.refined else "raw"
         line, valid = by_frame[method.edge][kind]
         if method.tracker == "memory":
-            lines = _remembered(film)
+            lines = _remembered(film, method.edge)
         else:
             if method.tracker == "kalman":
                 line, valid = _filtered(line, valid, KALMAN[kind])

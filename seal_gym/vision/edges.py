@@ -133,22 +133,6 @@ def check_images(images: Bytes, mask: Mask | None) -> tuple[Bytes, Mask]:
     return np.ascontiguousarray(colour), np.ascontiguousarray(mask)
 
 
-class EdgeDetector(Protocol):
-    """Anything that finds edges in images: the fractional-order stage, or a classical method."""
-
-    def __call__(self, images: Bytes, mask: NDArray[np.bool_] | None = None) -> EdgeMap:
-        """Finds the edges.
-
-        Args:
-            images: Grey, shape (N, height, width), or RGB, shape (N, height, width, 3).
-            mask: Where nothing may be an edge, shape (height, width).
-
-        Returns:
-            The edges.
-        """
-        ...
-
-
 def weights(alpha: float, length: int) -> Array:
     """Gruenwald-Letnikov weights of a derivative of fractional order (Eq. 2).
 
