@@ -5,7 +5,6 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +12,6 @@ import seal_gym
 from experiments import results, trials
 
 Row = dict[str, Any]
-
-_STACK = ("opencv-python-headless", "scikit-image")
-
-
-def _stack() -> dict[str, str]:
-    found = results.stack()
-    for name in _STACK:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 class Log:
@@ -37,7 +24,7 @@ class Log:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._rows: dict[str, list[Row]] = {}
-        code = trials._code()
+        code = trials.code()
         self._code = code
         for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
             try:
@@ -128,12 +115,12 @@ def write(out: Path, name: str, arguments: list[str], rows: list[Row], document:
         "name": name,
         "version": seal_gym.__version__,
         "command": shlex.join(["python", "-m", f"experiments.{name}", *arguments]),
-        "git_commit": results._commit(),
-        "stack": _stack(),
+        "git_commit": results.commit(),
+        "stack": results.stack(),
         "renderer": "raycast",
         "regime": "static",
     }
-    whole = results._document({**head, **document, "rows": rows})
+    whole = results.document_text({**head, **document, "rows": rows})
     (out / f"{name}.json").write_text(whole, encoding="utf-8")
     keys = list(dict.fromkeys(k for row in rows for k in row))
     with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:

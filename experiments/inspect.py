@@ -137,6 +137,7 @@ def leaves(
         seam_twist=core.seam_twist,
         tip_accel=observation[None, _TIP_ACCEL].astype(np.float64),
         part_pose=arm.part_pose,
+        seen=np.asarray(core.features.valid.all(axis=1)),
     )
     # As the expert: without a line there is no going on.
     speed = core.cfg.cell.process.speed_m_s if core.features.valid[0].all() else 0.0

@@ -22,6 +22,9 @@ _STACK = (
     "numpy",
     "numba",
     "scipy",
+    "opencv-python-headless",
+    "filterpy",
+    "scikit-image",
     "torch",
     "stable-baselines3",
 )
@@ -120,7 +123,12 @@ def stack() -> dict[str, str]:
     return found
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
+    """Hash of the checkout's commit.
+
+    Returns:
+        The hash, None outside a repository.
+    """
     root = Path(__file__).resolve().parents[1]
     run = subprocess.run(
         ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
@@ -154,14 +162,14 @@ def write(
         "name": name,
         "version": seal_gym.__version__,
         "command": shlex.join(["python", "-m", f"experiments.{name}", *arguments]),
-        "git_commit": _commit(),
+        "git_commit": commit(),
         "stack": stack(),
         "renderer": renderer,
         "regime": regime,
         "rows": rows,
         "trials": trials,
     }
-    (out / f"{name}.json").write_text(_document(document), encoding="utf-8")
+    (out / f"{name}.json").write_text(document_text(document), encoding="utf-8")
     with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
@@ -169,8 +177,15 @@ def write(
     (out / f"{name}.md").write_text((text or table(rows, markdown=True)) + "\n", encoding="utf-8")
 
 
-def _document(document: dict[str, Any]) -> str:
-    """JSON with a line for each key, row and trial, so that changes can be read as a diff."""
+def document_text(document: dict[str, Any]) -> str:
+    """JSON with a line for each key, row and trial, so that changes can be read as a diff.
+
+    Args:
+        document: What to write.
+
+    Returns:
+        The text.
+    """
     parts = []
     for key, value in document.items():
         if isinstance(value, list):

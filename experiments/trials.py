@@ -128,8 +128,12 @@ def _number(cell: str) -> float | None:
 
 
 @lru_cache(maxsize=1)
-def _code() -> str:
-    """Hash of everything a trial runs on besides its specification: sources, assets and packages."""
+def code() -> str:
+    """Hash of everything a trial runs on besides its specification: sources, assets and packages.
+
+    Returns:
+        Sixteen hexadecimal digits.
+    """
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256(json.dumps(results.stack(), sort_keys=True).encode())
     for folder in ("agents", "assets", "experiments", "seal_gym"):
@@ -232,7 +236,7 @@ def run_all(
             unit="trial",
         ):
             done[_key(row["method"], row["env_spec"])] = row
-            file.write(json.dumps({"code": _code(), **row}) + "\n")
+            file.write(json.dumps({"code": code(), **row}) + "\n")
             file.flush()
     return [done[_key(t.method, t.spec())] for t in wanted]
 
@@ -265,7 +269,7 @@ def _read_log(log: Path) -> dict[str, dict[str, Any]]:
             row = json.loads(line)
         except json.JSONDecodeError:
             continue  # the line a killed run was writing
-        if row.pop("code", None) != _code():
+        if row.pop("code", None) != code():
             continue  # another version's
         rows[_key(row["method"], row["env_spec"])] = row
     return rows

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from seal_gym.core.cell import CellCfg, LimitsCfg
 from seal_gym.core.errors import ActionError, ConfigError, require
@@ -43,6 +44,7 @@ class ArmState:
         tip_accel: Tip acceleration commanded a frame ago, shape (N, 6), m/s^2 and rad/s^2.
         part_pose: ``T_base_part``, shape (N, 4, 4), m: for leaves of the simulation's own (an obstacle's
             pose, say); policies are not told.
+        seen: Whether both views show the seam, shape (N,).
     """
 
     q: Array
@@ -52,6 +54,7 @@ class ArmState:
     seam_twist: Array
     tip_accel: Array
     part_pose: Array
+    seen: NDArray[np.bool_]
 
 
 LeafFunction = Callable[[ArmState], Leaf]
@@ -104,7 +107,8 @@ class RmpAdapter:
 
     Action: 6 entries of f scaled by the tip limits, then the 21 entries of the lower Cholesky factor of A,
     row by row, times ``CHOLESKY_SCALE``. Fixed leaves: damping against the reference twist, regularisation
-    towards the last tip acceleration, lean, joint limits (see ``seal_gym.rmp``).
+    towards the last tip acceleration, lean, joint limits (see ``seal_gym.rmp``). Without the seam in view the
+    reference is to stand still.
 
     Attributes:
         leaves: Functions that give one more leaf each; append at any time.
@@ -138,7 +142,8 @@ class RmpAdapter:
             ``policy``, the action's, then the fixed ones: ``damping``, ``regularisation``, ``lean``.
         """
         policy = TipRmp(action[:, :6] * self._scale, cholesky_metric(CHOLESKY_SCALE * action[:, 6:]))
-        reference = reference_twist(self._speed, state.seam_twist)
+        # Blind, the gun comes to rest.
+        reference = reference_twist(np.where(state.seen, self._speed, 0.0), state.seam_twist)
         fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
         return {"policy": policy, **dict(zip(FIXED_POLICIES, fixed, strict=True))}
 

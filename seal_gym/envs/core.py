@@ -271,6 +271,7 @@ class SealCore:
             seam_twist=self._rate.twist,
             tip_accel=self._tip_accel,
             part_pose=self.arm.part_pose,
+            seen=np.asarray(self.features.valid.all(axis=1)),
         )
 
     def _track(self, qdd: Array) -> None:

@@ -226,7 +226,7 @@ def update_features(features: RoiFeatures, lines: SeamLines, views: ViewGeometry
 
 
 @kernel
-def _length_inside(point: Array, direction: Array, size: Array) -> float:
+def length_inside(point: Array, direction: Array, size: Array) -> float:
     """Length of the part of a line that lies in the ROI [px] (Liang and Barsky's clipping)."""
     enter, leave = -np.inf, np.inf
     for r in range(2):
@@ -277,7 +277,7 @@ def _oracle_lines(
             point[i, v, 0], point[i, v, 1] = centre[v, 0] + focal[v] * x, centre[v, 1] + focal[v] * y
             u, w = dc[0] - x * dc[2], dc[1] - y * dc[2]
             direction[i, v, 0], direction[i, v, 1] = u, w
-            valid[i, v] = _length_inside(point[i, v], direction[i, v], size[v]) >= MIN_SEEN_PX
+            valid[i, v] = length_inside(point[i, v], direction[i, v], size[v]) >= MIN_SEEN_PX
 
 
 def oracle_lines(seam_point: Array, seam_tangent: Array, tip_pose: Array, views: ViewGeometry) -> SeamLines:

@@ -126,7 +126,7 @@ def _strip_stage(
     chosen = found.edge & ~mask & (line.bright_side * across > 0.5 * np.abs(along))
     chosen[[0, -1]] = chosen[:, [0, -1]] = False
     raw = np.zeros(2)
-    seen = ransac_line(found.edge, mask, found.intensity, ex, ey, t_ref, line.table, raw)
+    seen = ransac_line(found.edge, mask, found.intensity, ex, ey, t_ref, line.numbers, raw)
     return np.argwhere(chosen).astype(np.float64) + 0.5, raw if seen else None
 
 

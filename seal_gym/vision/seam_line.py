@@ -72,23 +72,24 @@ class LineCfg:
             require(0.0 < value <= top, f"LineCfg.{name} = {value!r}: must be within (0, {top}]")
 
     @property
-    def table(self) -> Array:
-        """The numbers as the kernels take them."""
-        return np.array(
-            [
-                self.bright_side,
-                self.hypotheses,
-                self.inlier_px,
-                self.max_slope,
-                self.reach_px,
-                self.min_contrast,
-                self.min_points,
-                self.search_px,
-                self.window_px,
-                self.seed,
-            ],
-            dtype=np.float64,
-        )
+    def numbers(self) -> "LineNumbers":
+        """The same as the kernels take them."""
+        return LineNumbers(*(float(getattr(self, name)) for name in LineNumbers._fields))
+
+
+class LineNumbers(NamedTuple):
+    """``LineCfg`` as the kernels take it; see there."""
+
+    bright_side: float
+    hypotheses: float
+    inlier_px: float
+    max_slope: float
+    reach_px: float
+    min_contrast: float
+    min_points: float
+    search_px: float
+    window_px: float
+    seed: float
 
 
 class StripLine(NamedTuple):
@@ -236,7 +237,7 @@ def row_edge(
     o: float,
     q: float,
     search: float,
-    par: Array,
+    par: LineNumbers,
     profile: Array,
     found: Array,
 ) -> bool:
@@ -250,7 +251,7 @@ def row_edge(
         o: Where the edge is expected in it.
         q: The edge's slope: the profile is a mean along it.
         search: How far from there [px].
-        par: ``LineCfg.table``.
+        par: ``LineCfg.numbers``.
         profile: Scratch, at least 32 long.
         found: Filled with the place [px] and the step [grey levels].
 
@@ -265,14 +266,14 @@ def row_edge(
     # Near the border: as much of the search as there is.
     first, last = max(middle - half, 0), min(middle + half, width)
     count = last - first
-    if count < 2 * _FLANK or not _profile(grey, row, q, first, count, par[0], profile):
+    if count < 2 * _FLANK or not _profile(grey, row, q, first, count, par.bright_side, profile):
         return False
     where = _boundary(profile, count, first, o, search)
     if where < 0:
         return False
     _place(profile, count, where, found)
     found[0] += first
-    if found[1] < par[5] or abs(found[0] - o) > search + 1.0:
+    if found[1] < par.min_contrast or abs(found[0] - o) > search + 1.0:
         return False
     return bool(_allowed(mask, edge, row, min(max(int(found[0]), 0), width - 1)))
 
@@ -287,7 +288,7 @@ def follow(
     q: float,
     ahead: float,
     behind: float,
-    par: Array,
+    par: LineNumbers,
     profile: Array,
     points: Array,
 ) -> int:
@@ -302,7 +303,7 @@ def follow(
         q: Expected slope there.
         ahead: How far to go ahead [px].
         behind: How far to go back [px].
-        par: ``LineCfg.table``.
+        par: ``LineCfg.numbers``.
         profile: Scratch.
         points: Filled with rows t - t_ref, o, step.
 
@@ -321,7 +322,7 @@ def follow(
         reach = ahead if way > 0 else behind
         hits = 0
         while abs(row + 0.5 - t_ref) <= reach and missed <= _GAP + 20 * (hits == 0) and abs(slope) < 2.0:
-            search = par[7] if hits == 0 else min(par[7], 1.5)
+            search = par.search_px if hits == 0 else min(par.search_px, 1.5)
             if count < len(points) and row_edge(grey, mask, edge, row, o, slope, search, par, profile, found):
                 error = found[0] - o
                 o += 0.5 * error
@@ -401,12 +402,12 @@ def fit_curve(
 
 
 @kernel
-def _ransac(t: Array, o: Array, vote: Array, n: int, par: Array, seed: np.uint64, line: Array) -> float:
+def _ransac(t: Array, o: Array, vote: Array, n: int, par: LineNumbers, seed: np.uint64, line: Array) -> float:
     """The line with the most votes, then fitted to its inliers; returns their votes."""
     best = 0.0
     word = seed
-    inlier, max_slope = par[2], par[3]
-    for _ in range(int(par[1])):
+    inlier, max_slope = par.inlier_px, par.max_slope
+    for _ in range(int(par.hypotheses)):
         word += _GOLDEN
         r = _random(word)
         i, j = int((r >> _S33) % np.uint64(n)), int((r & np.uint64(0x7FFFFFFF)) % np.uint64(n))
@@ -442,7 +443,14 @@ def _ransac(t: Array, o: Array, vote: Array, n: int, par: Array, seed: np.uint64
 
 @kernel
 def ransac_line(
-    edge: Mask, mask: Mask, intensity: Array, ex: Array, ey: Array, t_ref: float, par: Array, line: Array
+    edge: Mask,
+    mask: Mask,
+    intensity: Array,
+    ex: Array,
+    ey: Array,
+    t_ref: float,
+    par: LineNumbers,
+    line: Array,
 ) -> bool:
     """The line through the edge pixels of the expected polarity that are not the nozzle's.
 
@@ -453,7 +461,7 @@ def ransac_line(
         ex: Edge vector across the strip.
         ey: Edge vector along the strip.
         t_ref: The reference's t [px].
-        par: ``LineCfg.table``.
+        par: ``LineCfg.numbers``.
         line: p and q, filled.
 
     Returns:
@@ -472,25 +480,25 @@ def ransac_line(
                 for x in range(j - 1, j + 2):
                     across += ex[y, x]
                     along += ey[y, x]
-            if par[0] * across <= 0.5 * abs(along):
+            if par.bright_side * across <= 0.5 * abs(along):
                 continue
             t[n], o[n] = i + 0.5 - t_ref, j + 0.5
-            vote[n] = intensity[i, j] / (1.0 + (t[n] / par[4]) ** 2)
+            vote[n] = intensity[i, j] / (1.0 + (t[n] / par.reach_px) ** 2)
             n += 1
-    if n < par[6]:
+    if n < par.min_points:
         return False
-    return bool(_ransac(t, o, vote, n, par, np.uint64(int(par[9])), line) > 0.0)
+    return bool(_ransac(t, o, vote, n, par, np.uint64(int(par.seed)), line) > 0.0)
 
 
 @kernel
 def local_line(
-    points: Array, n: int, t_ref: float, o_ref: float, p: float, par: Array, work: Array, line: Array
+    points: Array, n: int, t_ref: float, o_ref: float, p: float, par: LineNumbers, work: Array, line: Array
 ) -> float:
     """Tangent of the local curve at its point nearest the reference; returns the mean step, 0 without."""
-    if n < par[6]:
+    if n < par.min_points:
         return 0.0
     step = 0.0
-    window = par[8]
+    window = par.window_px
     # Abscissae in windows keep the equations well conditioned.
     for k in range(n):
         u = points[k, 0] / window
@@ -519,7 +527,7 @@ def _find_batch(
     vector: Array,
     intensity: Array,
     edge: Mask,
-    par: Array,
+    par: LineNumbers,
     line: Array,
     raw: Array,
     confidence: Array,
@@ -538,7 +546,9 @@ def _find_batch(
             continue
         grey_sum(images[k], grey)
         p, q = raw[k, 0], raw[k, 1]
-        count = follow(grey, mask, edge[k], reference[0], p, q, par[8], par[8], par, profile, points)
+        count = follow(
+            grey, mask, edge[k], reference[0], p, q, par.window_px, par.window_px, par, profile, points
+        )
         confidence[k] = local_line(points, count, reference[0], reference[1], p, par, columns, line[k])
         valid[k] = confidence[k] > 0.0
 
@@ -566,5 +576,5 @@ def find_lines(
     edges = detector(images, mask)
     out = StripLine(np.zeros((n, 3)), np.full((n, 2), np.nan), np.zeros(n), np.zeros(n, np.bool_))
     found = (edges.vector, edges.intensity, edges.edge)
-    _find_batch(np.ascontiguousarray(images), mask, reference, *found, (cfg or LineCfg()).table, *out)
+    _find_batch(np.ascontiguousarray(images), mask, reference, *found, (cfg or LineCfg()).numbers, *out)
     return out

@@ -55,3 +55,89 @@ def test_the_oracle_without_images_measures_no_noise():
     env = gym.make("SealGym/Flat-v0", perception="oracle")
     assert "snr_db" not in env.reset(seed=0)[1]
     env.close()
+
+
+class Curtain:
+    """Something between the cameras and the seam for a few frames of an episode."""
+
+    def __init__(self, core, start, frames, change):
+        self.sensors, self.see = core.sensors, core.sensors.images
+        self.start, self.frames, self.change = start, frames, change
+        self.sensors.images = self.images
+
+    def images(self, pose, arm, frame):
+        seen = self.see(pose, arm, frame)
+        k = int(frame[0]) - self.start
+        if not 0 <= k < self.frames:
+            return seen
+        views = [seen.front.copy(), seen.side.copy()]
+        for view in views:
+            self.change(view[0], k, self.frames)
+        return seen._replace(front=views[0], side=views[1])
+
+
+def nothing(view, k, n):
+    view[:] = 120
+
+
+def hand(view, k, n):
+    """Skin with a wavy outline, from one side of the view to the other."""
+    rng, (height, width, _) = np.random.default_rng(k), view.shape
+    left = int(k / n * (width + 60)) - 60
+    for y in range(height):
+        a = left + int(8 * np.sin(y / 9))
+        span = slice(max(a, 0), max(min(a + 60, width), 0))
+        view[y, span] = np.clip(rng.normal([200, 150, 120], 8, view[y, span].shape), 0, 255)
+
+
+def shadow(view, k, n):
+    """A dark band that moves along the columns."""
+    left = k / n * (view.shape[1] + 30) - 30
+    x = np.arange(view.shape[1])
+    view[:] = np.where(((x > left) & (x < left + 30))[None, :, None], 0.45 * view, view)
+
+
+@pytest.mark.parametrize(
+    ("change", "frames", "blind"),
+    [(nothing, 9, (0, 1)), (nothing, 18, (9, 18)), (hand, 30, (1, 30)), (shadow, 30, (1, 30))],
+)
+@pytest.mark.parametrize(("part", "start"), [("flat", 300), ("rectangular", 325)])
+def test_what_hides_the_seam_stops_the_gun_and_does_not_lead_it_astray(part, start, change, frames, blind):
+    """On a straight, and at the box's first corner."""
+    env = gym.make("SealGym/Seal-v0", workpiece=part, control="rmp", disable_env_checker=True)
+    core, expert = env.unwrapped.core, RmpExpert()
+    Curtain(core, start, frames, change)
+    observation, _ = env.reset(seed=500_004)
+    invalid, speed, error = 0, [], []
+    for k in range(start + frames + 60):
+        observation, _, terminated, _, info = env.step(expert.predict(observation)[0])
+        assert not terminated
+        if k >= start:
+            invalid += not (observation[2] and observation[5])
+            speed.append(float(observation[12]))
+            error.append(info["tip_error_mm"])
+    env.close()
+    assert blind[0] <= invalid <= blind[1]
+    assert max(error) < 1.0  # contact is 1.06 mm away
+    assert max(speed) < 25.0  # mm/s along the seam: no dash
+    if invalid > 6:
+        assert min(speed) < 4.0
+    assert observation[2] and observation[5] and abs(speed[-1] - 10.0) < 1.0
+
+
+def test_a_seam_that_leaves_the_view_is_invalid_and_the_gun_stays():
+    env = gym.make("SealGym/Flat-v0", control="rmp", disable_env_checker=True)
+    core, expert = env.unwrapped.core, RmpExpert()
+    observation, _ = env.reset(seed=500_003)
+    for _ in range(150):
+        observation = env.step(expert.predict(observation)[0])[0]
+    pose = core.arm.part_pose[0].copy()
+    pose[2, 3] -= 0.1  # the part is taken away
+    core.arm.place_part(0, pose)
+    place = core.tip.pose[0, :3, 3].copy()
+    for _ in range(60):
+        observation = env.step(expert.predict(observation)[0])[0]
+    env.close()
+    assert not observation[2] and not observation[5]
+    assert np.linalg.norm(core.tip.pose[0, :3, 3] - place) < 0.01
+    assert np.abs(observation[11:14]).max() < 1.0  # mm/s

@@ -7,6 +7,7 @@ from seal_gym.core.errors import ConfigError
 from seal_gym.core.frames import tip_rotation, transform
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
+from seal_gym.vision.edges import EdgeStage
 from seal_gym.vision.features import RoiFeatures, ViewGeometry, oracle_lines, update_features
 from seal_gym.vision.perception import Perception, PerceptionCfg
 from seal_gym.workpieces.seam import seam_in_world
@@ -93,6 +94,22 @@ def test_rows_never_mix_and_runs_repeat():
             one = eyes.update(images.front[i : i + 1], images.side[i : i + 1], tips[i : i + 1])
             for a, b in zip(lines, one, strict=True):
                 np.testing.assert_array_equal(a[i], b[0])
+
+
+def test_threads_and_the_stage_as_a_detector_change_nothing():
+    ride = Ride("rectangular", range(5), 0.09)
+    nozzle = ride.core.sensors.nozzle
+    eyes = [
+        ride.perception(),
+        Perception(5, ride.views, nozzle, FRAME_S, threads=3),
+        Perception(5, ride.views, nozzle, FRAME_S, detector=EdgeStage()),
+    ]
+    for k in range(10):
+        images, tips, _ = ride.frame(k)
+        lines = [e.update(images.front, images.side, tips) for e in eyes]
+        for other in lines[1:]:
+            for a, b in zip(lines[0], other, strict=True):
+                np.testing.assert_array_equal(a, b)
 
 
 def test_only_rows_with_a_new_frame_look():
