@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -11,11 +12,13 @@ from seal_gym.core.errors import PhysicsError
 from seal_gym.core.frames import Array, quat_from_matrix
 from seal_gym.core.kinematics import T_TOOL0_TIP
 from seal_gym.core.paths import asset
-from seal_gym.sim import markers, texture
-from seal_gym.vision.part_pose import PartMarker
+from seal_gym.sim import texture
 from seal_gym.workpieces.solids import Solid
 from seal_gym.workpieces.surface import MATERIALS
 from seal_gym.workpieces.workpiece import PLATE_THICKNESS_M, Workpiece
+
+if TYPE_CHECKING:
+    from seal_gym.vision.part_pose import PartMarker
 
 # Geom groups: what MuJoCo's viewer and our renderers switch on and off together.
 GROUP_FURNITURE, GROUP_PART, GROUP_ROBOT, GROUP_COLLISION = 0, 1, 2, 3
@@ -45,7 +48,7 @@ class Scene:
     workpiece: Workpiece
     cell: CellCfg
     tool: Array
-    marker: PartMarker | None = None
+    marker: "PartMarker | None" = None
 
 
 def _add_furniture(spec: mujoco.MjSpec) -> None:
@@ -211,8 +214,10 @@ def _add_part(spec: mujoco.MjSpec, workpiece: Workpiece) -> None:
         _add_solid(part, spec, k, solid)
 
 
-def _add_marker(spec: mujoco.MjSpec, workpiece: Workpiece, cell: CellCfg) -> PartMarker:
+def _add_marker(spec: mujoco.MjSpec, workpiece: Workpiece, cell: CellCfg) -> "PartMarker":
     """The part's AR code and the camera above the cell that reads it."""
+    from seal_gym.sim import markers  # loads OpenCV and SciPy: only for marked parts
+
     marker = markers.part_marker(workpiece, cell.marker)
     size = (marker.label_m, marker.label_m)
     markers.add_label(

@@ -90,7 +90,8 @@ def main() -> None:
         print(
             f"{part:12} raw mj_step {raw:8.0f}/s = {raw / substeps:6.0f} frames/s | single {single:6.0f} "
             f"steps/s ({single * substeps / raw:.2f} of raw) | vector of 64, 2 threads {vector:6.0f} steps/s "
-            f"({vector * substeps / raw:.2f}) | by vision {sight[0]:6.0f} and {sight[1]:6.0f} steps/s | first step {fresh:.2f} s after gym.make"
+            f"({vector * substeps / raw:.2f}) | by vision {sight[0]:6.0f} and {sight[1]:6.0f} steps/s "
+            f"| first step {fresh:.2f} s after gym.make"
         )
 
 
