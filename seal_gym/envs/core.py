@@ -202,8 +202,8 @@ class SealCore:
             if not self.arm.contacts(i):
                 return hovering
         raise ConfigError(
-            f"no start in {_MAX_DRAWS} draws is free of contact and within the arm's reach: begin the seam where "
-            "there is more room, or reduce SealTaskCfg's hover_m, sideways_m or turned_rad"
+            f"no start in {_MAX_DRAWS} draws is free of contact and within the arm's reach: begin the seam "
+            "where there is more room, or reduce SealTaskCfg's hover_m, sideways_m or turned_rad"
         )
 
     def _draw_hover(self, rng: np.random.Generator) -> Array:

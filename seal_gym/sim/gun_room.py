@@ -12,7 +12,7 @@ from seal_gym.sim.scene import GUN_PREFIX, PART_PREFIX, Scene
 # Room for what the tip's path is off.
 _ROOM_M = 2e-4
 # A follower of second order (12 /s, damping ratio 0.7) lags a seam that starts to turn by up to 0.46 / 12 s,
-# and runs ahead by as much where it stops; perception adds about as much again.
+# and runs ahead by as much where it stops.
 _LAG_S = 0.04
 # Within this distance of a change of the seam's turning the gun may still swing.
 _SWING_M = 3e-3
@@ -42,7 +42,7 @@ class GunRoom:
         self._model, self._names = model, names
         self._data = mujoco.MjData(model)
         self._T_world_tip = tip_kinematics(np.zeros((1, 6)), np.zeros((1, 6))).pose[0]
-        self._groups = np.arange(mujoco.mjNGROUP) == _SIGHT_GROUP
+        self._groups = (np.arange(mujoco.mjNGROUP) == _SIGHT_GROUP).astype(np.uint8)
         self._cameras = [(c.name, self._T_world_tip[:3, :3] @ c.position_m) for c in scene.cell.cameras]
 
     def _place(self, T_part_tip: Array) -> Array:
@@ -89,7 +89,15 @@ class GunRoom:
             for ray in goals - eye:
                 distance = float(np.linalg.norm(ray))
                 seen = mujoco.mj_ray(
-                    self._model, self._data, eye, ray / distance, self._groups.astype(np.uint8), 1, -1, hit, None
+                    self._model,
+                    self._data,
+                    eye,
+                    ray / distance,
+                    self._groups,
+                    1,
+                    -1,
+                    hit,
+                    None,
                 )
                 if 0.0 <= seen < distance - _SEEN_M:
                     return name
@@ -137,7 +145,8 @@ def room_along(scene: Scene, s: Array) -> str:
             if share:
                 turned[:3, :3] = axis_angle(swing / angle, share * angle) @ pose[:3, :3]
             if pair := room.touching(turned):
-                by = f", swung by {np.rad2deg(angle):.1f} deg as it may be where the seam turns" if share else ""
+                degrees = f"{np.rad2deg(angle):.1f} deg"
+                by = f", swung by {degrees} as it may be where the seam turns" if share else ""
                 return f"{pair[0]} and {pair[1]} touch at {at * 1e3:.0f} mm along the seam{by}"
     return ""
 

@@ -31,7 +31,7 @@ _MAX_SPEED_RAD_S = 2.7
 # From station to station no joint turns as far, unless the branch ends in between.
 _JUMP_RAD = 1.0
 # Beside the part stations lie closer together.
-_ROOM_STEP_M = 1.25e-3
+_ROOM_STEP_M, _SIGHT_STEP_M = 1.25e-3, 2.5e-3
 # In a hollow bend the mouth, nearer to its centre than the seam, goes a shorter way round: in tighter ones
 # the loop through servo and nearest point rings, and the mouth meets the wall.
 _MIN_HOLLOW_M = 15e-3
@@ -49,8 +49,8 @@ class Reach(NamedTuple):
         start_q: Posture at the seam's start with the part in its nominal pose, shape (6,), rad.
         smallest_singular: Of the scaled Jacobian over all postures checked.
         joint_range: Smallest and largest joint angles met, shape (2, 6), rad.
-        joint_speed: Largest root of the sum of the joints' squared speeds that the seam takes at nominal speed
-            [rad/s].
+        joint_speed: What the joints turn together, root of the sum of squares, where they have to turn
+            fastest to follow the seam at nominal speed [rad/s].
     """
 
     part_pose: Array
@@ -83,9 +83,9 @@ def check_reach(scene: Scene, shift_m: float, yaw_rad: float, *, by_vision: bool
         The posture to start from, and how close the arm comes to its limits.
 
     Raises:
-        SeamError: If the gun has no room, the seam cannot be seen, a stretch is out of reach, at a joint limit
-            or singular, or gun, arm or cameras touch something there; the message names the place, and a
-            pose that would do if there is one.
+        SeamError: If the gun has no room, the seam cannot be seen, a stretch is out of reach, at a joint
+            limit, too fast or singular, or gun, arm or cameras touch something there; the message names the
+            place, and a pose that would do if there is one.
     """
     part = scene.workpiece
     _check_beside_part(scene, by_vision)
@@ -114,17 +114,16 @@ def _check_beside_part(scene: Scene, by_vision: bool) -> None:
     name, seam = scene.workpiece.name, scene.workpiece.seam
     if why := _too_hollow(seam):
         raise SeamError(f"workpiece {name!r} cannot be sealed: {why}")
-    s = _stations(seam, _ROOM_STEP_M)
-    if why := room_along(scene, s):
+    if why := room_along(scene, _stations(seam, _ROOM_STEP_M)):
         raise SeamError(
-            f"workpiece {name!r} leaves the gun no room: {why} (a bend tighter than the gun allows, or a wall in "
-            "its way), wherever the part stands: widen the bend, lower the wall, change the approach direction "
-            "or travel the other way"
+            f"workpiece {name!r} leaves the gun no room: {why} (a bend tighter than the gun allows, or a "
+            "wall in its way), wherever the part stands: widen the bend, lower the wall, change the approach "
+            "direction or travel the other way"
         )
-    if by_vision and (why := sight_along(scene, s)):
+    if by_vision and (why := sight_along(scene, _stations(seam, _SIGHT_STEP_M))):
         raise SeamError(
-            f"workpiece {name!r} cannot be sealed by vision: {why}: widen the bend, lower the wall or travel the "
-            "other way; perception='oracle' needs no sight"
+            f"workpiece {name!r} cannot be sealed by vision: {why}: widen the bend, lower the wall or travel "
+            "the other way; perception='oracle' needs no sight"
         )
 
 
@@ -140,8 +139,8 @@ def _too_hollow(seam: Seam) -> str:
     first = int(tight[0])
     return (
         f"the hollow bend at {max(seam.arc[first], 0.0) * 1e3:.0f} mm along the seam has a radius of "
-        f"{1e3 / size[first]:.1f} mm, and the gun, leaning over it, follows {_MIN_HOLLOW_M * 1e3:g} mm or more: "
-        "enlarge corner_radius, or give more points along the bend"
+        f"{1e3 / size[first]:.1f} mm, and the gun, leaning over it, follows {_MIN_HOLLOW_M * 1e3:g} mm or "
+        "more: enlarge corner_radius, or give more points along the bend"
     )
 
 
@@ -212,7 +211,7 @@ def _smallest_singular(q: Array) -> Array:
 
 
 class _Fit(NamedTuple):
-    """Why a branch cannot carry the gun along the seam, empty if it can; its smallest singular value, speed."""
+    """Why a branch cannot carry the gun along the seam, empty if it can; smallest singular value, speed."""
 
     why: str
     singular: float = 0.0
@@ -231,7 +230,9 @@ def _fit(q: Array, s: Array, took_s: Array) -> _Fit:
     outside = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=0)
     if outside.any():
         station, joint = np.argwhere(outside)[0]
-        return _Fit(f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam")
+        return _Fit(
+            f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam"
+        )
     smallest = _smallest_singular(q.reshape(-1, 6)).reshape(q.shape[:2]).min(axis=0)
     if smallest.min() < _MIN_SINGULAR:
         return _Fit(f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam")
@@ -239,8 +240,9 @@ def _fit(q: Array, s: Array, took_s: Array) -> _Fit:
     worst = int(np.argmax(speed))
     if speed[worst] > _MAX_SPEED_RAD_S:
         return _Fit(
-            f"the joints would have to turn at {speed[worst]:.1f} rad/s together at {s[worst] * 1e3:.0f} mm along "
-            f"the seam, more than the {_MAX_SPEED_RAD_S:g} rad/s they follow without swinging: widen the bend there"
+            f"the joints would have to turn at {speed[worst]:.1f} rad/s together at {s[worst] * 1e3:.0f} mm "
+            f"along the seam, more than the {_MAX_SPEED_RAD_S:g} rad/s they follow without swinging: widen "
+            "the bend there"
         )
     return _Fit("", float(smallest.min()), float(speed[worst]))
 

@@ -179,7 +179,7 @@ class Progress:
             self._visited,
             self._covered,
         )
-        # Past the end there is no ground to gain: a tip that skipped a stretch could go on and be paid for it.
+        # Past the end there is no ground to gain: who skipped a stretch could go on and be paid for it.
         ahead = np.maximum(self.furthest, self.s)
         self.furthest = np.where(self.furthest < self._seam.length, ahead, self.furthest)
         self._settled |= self.s >= cfg.settle_m

@@ -14,7 +14,7 @@ SCALE = np.array([1e3] * 3 + [np.rad2deg(25.0)] * 3)  # an action of 1 in mm/s2 
 
 
 def steer(o, speed, offset=(0.0, 0.0)):
-    """Tip acceleration that keeps to the seam, moved by an offset in x and z [mm], at a speed along it [mm/s]."""
+    """Tip acceleration that keeps to the seam, moved by an offset in x and z [mm], at a speed [mm/s]."""
     error = np.array([o[0] + offset[0], 0.0, o[3] + offset[1], o[4], o[10], -o[1]])
     goal = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0])
     gain = np.array([60.0, 0.0, 60.0, 60.0, 20.0, 60.0])
@@ -110,7 +110,7 @@ def test_no_attack_earns_more_than_finishing(part, finishing, attack):
     rewards, furthest, outcome = play(part, "tip", attack)
     assert outcome == "timeout"
     assert rewards.sum() < finishing - 10.0
-    # Nor more than the ground it gained along the seam is worth, with the way down from the hover (at most 2).
+    # Nor more than the ground it gained is worth, with the way down from the hover (at most 2).
     assert rewards.sum() <= min(furthest / LENGTH_M, 1.0) * NOMINAL_STEPS + 2.0 + 1.0
 
 
