@@ -107,7 +107,9 @@ class SealCore:
         cell, task = cfg.cell, cfg.task
         self.cfg, self.n = cfg, n
         self.scene: Scene = cached_scene(catalogue.get(cfg.workpiece), cell)
-        self._reach = check_reach(self.scene, task.part_shift_m, task.part_yaw_rad)
+        self._reach = check_reach(
+            self.scene, task.part_shift_m, task.part_yaw_rad, by_vision=cfg.perception == "vision"
+        )
         self._seam = self.scene.workpiece.seam
         self.arm = ArmBatch(self.scene, n, cfg.threads)
         self.adapter = make_adapter(cfg.control, cell, cfg.leaves)
@@ -175,9 +177,7 @@ class SealCore:
         shift = rng.uniform(-task.part_shift_m, task.part_shift_m, 2)
         yaw = rng.uniform(-task.part_yaw_rad, task.part_yaw_rad)
         part_pose = self._reach.part_pose @ yaw_pose(shift[0], shift[1], 0.0, yaw)
-        hovering = self._draw_hover(rng)
-        q = ik.nearest(ik.solve(part_pose @ hovering), self._reach.start_q)
-        self.arm.reset(i, q, part_pose)
+        hovering = self._hover(i, part_pose, rng)
         row = tip_kinematics(self.arm.q[i : i + 1], self.arm.qd[i : i + 1])
         for values, new in zip(self.tip, row, strict=True):
             values[i] = new[0]
@@ -190,6 +190,21 @@ class SealCore:
         self._tip_accel[i] = 0.0
         self._action[i] = 0.0
         self.frames[i] = 0
+
+    def _hover(self, i: int, part_pose: Array, rng: np.random.Generator) -> Array:
+        """Puts the gun in a hover where it touches nothing; gives ``T_part_tip``."""
+        for _ in range(_MAX_DRAWS):
+            hovering = self._draw_hover(rng)
+            q = ik.nearest(ik.solve(part_pose @ hovering), self._reach.start_q)
+            if np.isnan(q).any():
+                continue
+            self.arm.reset(i, q, part_pose)
+            if not self.arm.contacts(i):
+                return hovering
+        raise ConfigError(
+            f"no start in {_MAX_DRAWS} draws is free of contact and within the arm's reach: begin the seam "
+            "where there is more room, or reduce SealTaskCfg's hover_m, sideways_m or turned_rad"
+        )
 
     def _draw_hover(self, rng: np.random.Generator) -> Array:
         """``T_part_tip`` of a start from which both ROIs see the seam, drawn until one does.

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,31 @@ def check_render_mode(render_mode: str | None, allowed: list[str]) -> None:
         render_mode is None or render_mode in allowed,
         f"render_mode = {render_mode!r}: must be None or one of {allowed}",
     )
+
+
+def _check_screen() -> None:
+    """Asks for a screen before MuJoCo's viewer does, which ends the process where it finds none.
+
+    Raises:
+        RenderError: If there is none.
+    """
+    if sys.platform != "linux":
+        return  # there always is one; and macOS lets only the main thread ask
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RenderError(
+            'render_mode="human" needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set: use '
+            'render_mode="rgb_array"'
+        )
+    import glfw  # what MuJoCo's viewer opens its window with
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = glfw.init()
+    if not opened:
+        raise RenderError(
+            f'render_mode="human" needs a screen, and none answers at DISPLAY={os.environ.get("DISPLAY")!r}, '
+            f'WAYLAND_DISPLAY={os.environ.get("WAYLAND_DISPLAY")!r}: use render_mode="rgb_array"'
+        )
 
 
 def fitted(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
@@ -224,14 +250,7 @@ class SceneView:
         """
         core = self._core
         if self._viewer is None:
-            # GLFW ends the process where it finds no screen: ask before.
-            if sys.platform == "linux" and not (
-                os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-            ):
-                raise RenderError(
-                    'render_mode="human" needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set: use '
-                    'render_mode="rgb_array"'
-                )
+            _check_screen()
             from mujoco import viewer  # loads GLFW: only with a screen
 
             self._viewer_data = mujoco.MjData(core.scene.model)

@@ -1,6 +1,9 @@
-"""Whether the arm can seal a part: every posture along the seam, at every displacement of the part."""
+"""Whether the cell can seal a part: room for the gun, sight of the seam, and the arm's postures.
 
-import copy
+Gun, cameras and part are rigid: room and sight are the same wherever the part stands. The arm's postures are
+looked at along the whole seam at every displacement of the part.
+"""
+
 from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
@@ -9,9 +12,10 @@ import mujoco
 import numpy as np
 
 from seal_gym.core.errors import SeamError
-from seal_gym.core.frames import Array, tip_rotation, transform, yaw_pose
+from seal_gym.core.frames import Array, yaw_pose
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, tip_kinematics
 from seal_gym.planning import ik
+from seal_gym.sim.gun_room import room_along, sight_along, tip_poses
 from seal_gym.sim.scene import Scene
 from seal_gym.workpieces.seam import Seam
 
@@ -21,13 +25,18 @@ _STEP_M = 5e-3
 _MIN_SINGULAR = 0.05
 _LENGTH_M = 0.25
 _TURN_RAD = np.deg2rad(15.0)
+# What the joints may turn together (root of the sum of squares) where the seam bends: beyond about this the
+# servos' lag swings the nozzle by the millimetre it is off the wall.
+_MAX_SPEED_RAD_S = 2.7
 # From station to station no joint turns as far, unless the branch ends in between.
 _JUMP_RAD = 1.0
-# Beside the part stations lie closer together, and the gun needs room for what the tip's path is off.
-_CLOSER = 4
-_ROOM_M = 2e-4
+# Beside the part stations lie closer together.
+_ROOM_STEP_M, _SIGHT_STEP_M = 1.25e-3, 2.5e-3
+# In a hollow bend the mouth, nearer to its centre than the seam, goes a shorter way round: in tighter ones
+# the loop through servo and nearest point rings, and the mouth meets the wall.
+_MIN_HOLLOW_M = 15e-3
+_LEANS_IN = 0.4  # share of the approach direction towards the bend's centre that makes it a hollow one
 _ELBOW_UP = 5
-_PART_PREFIX = "col_part"
 _TRY_DISTANCE_M = (0.45, 0.35, 0.40, 0.50)
 _TRY_YAW_RAD = (0.0, 0.79, 1.57, 2.36, 3.14, -2.36, -1.57, -0.79)
 
@@ -40,12 +49,15 @@ class Reach(NamedTuple):
         start_q: Posture at the seam's start with the part in its nominal pose, shape (6,), rad.
         smallest_singular: Of the scaled Jacobian over all postures checked.
         joint_range: Smallest and largest joint angles met, shape (2, 6), rad.
+        joint_speed: What the joints turn together, root of the sum of squares, where they have to turn
+            fastest to follow the seam at nominal speed [rad/s].
     """
 
     part_pose: Array
     start_q: Array
     smallest_singular: float
     joint_range: Array
+    joint_speed: float
 
 
 def _displacements(shift_m: float, yaw_rad: float) -> Array:
@@ -55,22 +67,28 @@ def _displacements(shift_m: float, yaw_rad: float) -> Array:
 
 
 @lru_cache(maxsize=32)
-def check_reach(scene: Scene, shift_m: float, yaw_rad: float) -> Reach:
+def check_reach(scene: Scene, shift_m: float, yaw_rad: float, *, by_vision: bool = False) -> Reach:
     """Checks that one branch of the inverse kinematics carries the gun along the whole seam.
+
+    Before it looks at the arm it checks what no place of the part can mend: the gun's room beside the part
+    and, for vision, the cameras' sight of the seam past the part.
 
     Args:
         scene: The scene with the part.
         shift_m: Largest displacement of the part in x and y [m].
         yaw_rad: Largest rotation of the part about its origin [rad].
+        by_vision: Whether the cameras have to see the seam.
 
     Returns:
         The posture to start from, and how close the arm comes to its limits.
 
     Raises:
-        SeamError: If a stretch is out of reach, at a joint limit or singular, or gun, arm or cameras touch
-            something there; the message names the place, and a pose that would do if there is one.
+        SeamError: If the gun has no room, the seam cannot be seen, a stretch is out of reach, at a joint
+            limit, too fast or singular, or gun, arm or cameras touch something there; the message names the
+            place, and a pose that would do if there is one.
     """
     part = scene.workpiece
+    _check_beside_part(scene, by_vision)
     displacements = _displacements(shift_m, yaw_rad)
     found = _try(scene, part.pose, displacements, _STEP_M)
     if isinstance(found, Reach):
@@ -91,17 +109,54 @@ def check_reach(scene: Scene, shift_m: float, yaw_rad: float) -> Reach:
     )
 
 
+def _check_beside_part(scene: Scene, by_vision: bool) -> None:
+    """Refuses a part that leaves the gun no room or hides the seam, wherever it stands."""
+    name, seam = scene.workpiece.name, scene.workpiece.seam
+    if why := _too_hollow(seam):
+        raise SeamError(f"workpiece {name!r} cannot be sealed: {why}")
+    if why := room_along(scene, _stations(seam, _ROOM_STEP_M)):
+        raise SeamError(
+            f"workpiece {name!r} leaves the gun no room: {why} (a bend tighter than the gun allows, or a "
+            "wall in its way), wherever the part stands: widen the bend, lower the wall, change the approach "
+            "direction or travel the other way"
+        )
+    if by_vision and (why := sight_along(scene, _stations(seam, _SIGHT_STEP_M))):
+        raise SeamError(
+            f"workpiece {name!r} cannot be sealed by vision: {why}: widen the bend, lower the wall or travel "
+            "the other way; perception='oracle' needs no sight"
+        )
+
+
+def _too_hollow(seam: Seam) -> str:
+    """The first bend round the gun that is tighter than the gun can follow; empty if there is none."""
+    curvature = np.diff(seam.tangent, axis=0) / np.diff(seam.arc)[:, None]
+    size = np.linalg.norm(curvature, axis=1)
+    inward = np.sum(curvature * seam.approach[:-1], axis=1) > _LEANS_IN * size
+    inside = (seam.arc[1:] > 0.0) & (seam.arc[:-1] < seam.length)
+    tight = np.flatnonzero(inward & inside & (size * _MIN_HOLLOW_M > 1.0 + 1e-3))
+    if not len(tight):
+        return ""
+    first = int(tight[0])
+    return (
+        f"the hollow bend at {max(seam.arc[first], 0.0) * 1e3:.0f} mm along the seam has a radius of "
+        f"{1e3 / size[first]:.1f} mm, and the gun, leaning over it, follows {_MIN_HOLLOW_M * 1e3:g} mm or "
+        "more: enlarge corner_radius, or give more points along the bend"
+    )
+
+
 def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) -> Reach | str:
     """How the arm seals the part at a nominal pose, or why it cannot."""
     seam = scene.workpiece.seam
     s = _stations(seam, step_m)
     displaced = part_pose @ displacements
     q = np.unwrap(
-        ik.solve(displaced[:, None] @ _tip_poses(scene, s)[None]), axis=1
+        ik.solve(displaced[:, None] @ tip_poses(scene, s)[None]), axis=1
     )  # (displacement, station, branch, joint)
     # A whole turn more or less keeps the posture: bring the middle of each joint's travel near zero.
     q -= 2 * np.pi * np.round((q.max(axis=1, keepdims=True) + q.min(axis=1, keepdims=True)) / (4 * np.pi))
-    fits = [_fit(q[:, :, b], s) for b in range(ik.BRANCHES)]
+    path = tip_poses(scene, s)[:, :3, 3]
+    took_s = np.linalg.norm(np.diff(path, axis=0), axis=1) / scene.cell.process.speed_m_s
+    fits = [_fit(q[:, :, b], s, took_s) for b in range(ik.BRANCHES)]
     # Elbow up first: the branch of the nominal parts, which keeps the forearm off the table. Then the
     # branch that stays farthest from a singularity.
     order = sorted(range(ik.BRANCHES), key=lambda b: (b != _ELBOW_UP, -fits[b].singular))
@@ -109,7 +164,7 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
     for b in order:
         if fits[b].why:
             continue
-        why = _touching(scene, q[:, :, b], displaced, s) or _tight(scene, part_pose, b, step_m)
+        why = _touching(scene, q[:, :, b], displaced, s)
         if not why:
             flat = q[:, :, b].reshape(-1, 6)
             return Reach(
@@ -117,10 +172,9 @@ def _try(scene: Scene, part_pose: Array, displacements: Array, step_m: float) ->
                 start_q=q[0, 0, b],
                 smallest_singular=fits[b].singular,
                 joint_range=np.stack((flat.min(axis=0), flat.max(axis=0))),
+                joint_speed=fits[b].speed,
             )
         contacts.append(why)
-    # What a user can mend first: a contact with the part.
-    contacts.sort(key=lambda why: _PART_PREFIX not in why)
     return contacts[0] if contacts else fits[_ELBOW_UP].why
 
 
@@ -157,58 +211,45 @@ def _smallest_singular(q: Array) -> Array:
 
 
 class _Fit(NamedTuple):
-    """Why a branch cannot carry the gun along the seam, empty if it can; its smallest singular value."""
+    """Why a branch cannot carry the gun along the seam, empty if it can; smallest singular value, speed."""
 
     why: str
-    singular: float
+    singular: float = 0.0
+    speed: float = np.inf
 
 
-def _fit(q: Array, s: Array) -> _Fit:
-    """Judges one branch; q: (displacement, station, joint)."""
+def _fit(q: Array, s: Array, took_s: Array) -> _Fit:
+    """Judges one branch; q: (displacement, station, joint), took_s: from station to station."""
     missing = np.isnan(q).any(axis=(0, 2))
     if missing.any():
-        return _Fit(f"the seam at {s[missing][0] * 1e3:.0f} mm is out of the arm's reach", 0.0)
-    jump = (np.abs(np.diff(q, axis=1)) > _JUMP_RAD).any(axis=(0, 2))
+        return _Fit(f"the seam at {s[missing][0] * 1e3:.0f} mm is out of the arm's reach")
+    turned = np.diff(q, axis=1)
+    jump = (np.abs(turned) > _JUMP_RAD).any(axis=(0, 2))
     if jump.any():
-        return _Fit(f"the wrist would turn over at {s[1:][jump][0] * 1e3:.0f} mm along the seam", 0.0)
+        return _Fit(f"the wrist would turn over at {s[1:][jump][0] * 1e3:.0f} mm along the seam")
     outside = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=0)
     if outside.any():
         station, joint = np.argwhere(outside)[0]
         return _Fit(
-            f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam", 0.0
+            f"joint {joint + 1} would go beyond its limit at {s[station] * 1e3:.0f} mm along the seam"
         )
     smallest = _smallest_singular(q.reshape(-1, 6)).reshape(q.shape[:2]).min(axis=0)
     if smallest.min() < _MIN_SINGULAR:
+        return _Fit(f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam")
+    speed = (np.linalg.norm(turned, axis=2) / took_s).max(axis=0)
+    worst = int(np.argmax(speed))
+    if speed[worst] > _MAX_SPEED_RAD_S:
         return _Fit(
-            f"the arm is near a singularity at {s[np.argmin(smallest)] * 1e3:.0f} mm along the seam", 0.0
+            f"the joints would have to turn at {speed[worst]:.1f} rad/s together at {s[worst] * 1e3:.0f} mm "
+            f"along the seam, more than the {_MAX_SPEED_RAD_S:g} rad/s they follow without swinging: widen "
+            "the bend there"
         )
-    return _Fit("", float(smallest.min()))
+    return _Fit("", float(smallest.min()), float(speed[worst]))
 
 
-def _tight(scene: Scene, part_pose: Array, branch: int, step_m: float) -> str:
-    """The first place, looked at closely, where the gun has no room beside the part; empty if there is none.
-
-    Gun and part are rigid, so that this does not depend on where the part stands.
-    """
-    s = _stations(scene.workpiece.seam, step_m / _CLOSER)
-    q = ik.solve(part_pose @ _tip_poses(scene, s))[:, branch]
-    if np.isnan(q).any():
-        return ""  # at the edge of the reach: the coarser check has judged it
-    return _touching(scene, q[None], part_pose[None], s, _ROOM_M)
-
-
-def _tip_poses(scene: Scene, s: Array) -> Array:
-    """``T_part_tip`` of the desired motion at arc lengths, shape (n, 4, 4)."""
-    p, t, a = scene.workpiece.seam.at(s)
-    return transform(tip_rotation(t, a), p + scene.cell.process.stand_off_m * a)
-
-
-def _touching(scene: Scene, q: Array, displaced: Array, s: Array, room_m: float = 0.0) -> str:
-    """The first place along the seam where geoms come closer than ``room_m``; empty if there is none."""
+def _touching(scene: Scene, q: Array, displaced: Array, s: Array) -> str:
+    """The first place along the seam where geoms touch; empty if there is none."""
     model = scene.model
-    if room_m:
-        model = copy.copy(model)
-        model.geom_margin[:] = room_m
     data = mujoco.MjData(model)
     for pose, postures in zip(displaced, q, strict=True):
         data.mocap_pos[0] = pose[:3, 3]
@@ -220,9 +261,5 @@ def _touching(scene: Scene, q: Array, displaced: Array, s: Array, room_m: float 
             mujoco.mj_collision(model, data)
             if data.ncon:
                 names = [model.geom(int(g)).name for g in (data.contact[0].geom1, data.contact[0].geom2)]
-                hint = " (a bend tighter than the gun allows, or a wall in its way)"
-                return (
-                    f"{names[0]} and {names[1]} touch at {station * 1e3:.0f} mm along the seam"
-                    f"{hint if any(n.startswith(_PART_PREFIX) for n in names) else ''}"
-                )
+                return f"{names[0]} and {names[1]} touch at {station * 1e3:.0f} mm along the seam"
     return ""

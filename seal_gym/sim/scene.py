@@ -26,6 +26,7 @@ GROUP_FURNITURE, GROUP_PART, GROUP_ROBOT, GROUP_COLLISION = 0, 1, 2, 3
 _ENVIRONMENT = {"contype": 2, "conaffinity": 1}
 _VISUAL = {"contype": 0, "conaffinity": 0}
 GUN_PREFIX = "gun/"
+PART_PREFIX = "col_part_"
 TABLE_TOP_M = -0.05 - PLATE_THICKNESS_M
 _FLOOR_M = -0.80
 
@@ -156,7 +157,7 @@ def _add_sensor_cameras(body: mujoco.MjsBody, cell: CellCfg) -> None:
 
 def _add_solid(body: mujoco.MjsBody, spec: mujoco.MjSpec, k: int, solid: Solid) -> None:
     common = {
-        "name": f"col_part_{k}",
+        "name": f"{PART_PREFIX}{k}",
         "pos": solid.pose[:3, 3],
         "quat": quat_from_matrix(solid.pose[:3, :3]),
         "group": GROUP_COLLISION,

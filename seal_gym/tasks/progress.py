@@ -106,7 +106,7 @@ class Progress:
     Attributes:
         s: Arc length of the path's point nearest the tip, found locally: it moves by at most the window in
             a frame, so it never jumps to another side, shape (N,), m.
-        furthest: The largest ``s`` of the episode, shape (N,), m.
+        furthest: The largest ``s`` of the episode up to the first beyond the end, shape (N,), m.
         error_m: Distance from the tip to the nearest point of the desired path, shape (N,), m.
         off_path_m: Distance to the path's point at ``s``, shape (N,), m.
     """
@@ -179,7 +179,9 @@ class Progress:
             self._visited,
             self._covered,
         )
-        self.furthest = np.maximum(self.furthest, self.s)
+        # Past the end there is no ground to gain: who skipped a stretch could go on and be paid for it.
+        ahead = np.maximum(self.furthest, self.s)
+        self.furthest = np.where(self.furthest < self._seam.length, ahead, self.furthest)
         self._settled |= self.s >= cfg.settle_m
         squared = self.error_m**2
         self._sums[:, 0] += squared * self._settled

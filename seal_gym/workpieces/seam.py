@@ -32,8 +32,8 @@ MAX_LEAN_RATE_RAD_M = np.deg2rad(300.0)
 MAX_LEAN_CHANGE_RAD = np.deg2rad(10.0)
 # What is nearer to the direction of travel leaves the lean undefined.
 MIN_CROSSING_RAD = np.deg2rad(30.0)
-# Under 30 deg the nozzle's mouth is within 0.2 mm of the wall, beyond 60 deg of the plate.
-FILLET_LEAN_RAD = (np.deg2rad(30.0), np.deg2rad(60.0))
+# Under 35 deg the nozzle's mouth is within 0.5 mm of the wall, beyond 55 deg of the plate.
+FILLET_LEAN_RAD = (np.deg2rad(35.0), np.deg2rad(55.0))
 # The seam runs on past both ends of the sealed stretch, or the ROIs would see its end.
 RUN_ON_M = 0.03
 _SELF_CLEARANCE_M = 2e-3

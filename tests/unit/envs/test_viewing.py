@@ -1,5 +1,11 @@
 """Pictures: the ROIs are where the panel says, the trail follows the mouth, errors say what to do."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import glfw
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -133,6 +139,34 @@ def test_the_trail_begins_anew_with_each_episode():
     env.close()
 
 
+HUMAN = """
+import gymnasium as gym, seal_gym
+from seal_gym.core.errors import RenderError
+env = gym.make("SealGym/Flat-v0", render_mode="human", perception="oracle")
+try:
+    env.reset(seed=0)
+except RenderError as error:
+    print("refused:", error)
+env.close()
+print("alive")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there always is a screen")
+@pytest.mark.parametrize("display", [None, ":77"])
+def test_without_a_screen_the_process_lives_on(display):
+    """No display, and one that does not answer: GLFW itself would end the process."""
+    environ = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environ |= {"MUJOCO_GL": "disabled", **({"DISPLAY": display} if display else {})}
+    root = Path(__file__).resolve().parents[3]
+    run = subprocess.run(
+        [sys.executable, "-c", HUMAN], cwd=root, env=environ, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "refused:" in run.stdout and "rgb_array" in run.stdout
+    assert run.stdout.endswith("alive\n")
+
+
 def test_a_viewer_without_a_screen_says_so(monkeypatch):
     viewer = pytest.importorskip("mujoco.viewer")
 
@@ -144,6 +178,7 @@ def test_a_viewer_without_a_screen_says_so(monkeypatch):
     with pytest.raises(RenderError, match="DISPLAY"):
         viewing.SceneView(core()).sync()
     monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(glfw, "init", lambda: True)
     monkeypatch.setattr(viewer, "launch_passive", broken)
     with pytest.raises(RenderError, match="rgb_array"):
         viewing.SceneView(core()).sync()
@@ -165,6 +200,7 @@ def test_the_viewer_is_shown_the_current_state(monkeypatch):
             shown["closed"] = True
 
     monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(glfw, "init", lambda: True)
     monkeypatch.setattr(viewer, "launch_passive", Window)
     view = viewing.SceneView(c)
     view.sync()

@@ -55,11 +55,11 @@ def test_check_is_quick(name: str) -> None:
     check_reach(scene, SHIFT_M, YAW_RAD)
     times = []
     for k in range(3):
-        begin = time.perf_counter()
-        check_reach(scene, SHIFT_M, YAW_RAD + 1e-9 * (k + 1))
-        times.append(time.perf_counter() - begin)
-    # 0.04 s on two idle cores; the rest is for a busy machine.
-    assert min(times) < 0.15
+        begin = time.process_time()
+        check_reach(scene, SHIFT_M, YAW_RAD + 1e-9 * (k + 1), by_vision=True)
+        times.append(time.process_time() - begin)
+    # 0.07 s on an idle machine; the rest is for a busy one.
+    assert min(times) < 0.25
 
 
 def test_part_beyond_the_arm_is_refused_with_a_pose_that_would_do() -> None:
@@ -154,12 +154,75 @@ def test_a_part_without_a_pose_is_put_where_it_can_be_sealed():
     assert np.arctan2(shift[1, 0], shift[0, 0]) == pytest.approx(0.0, abs=np.deg2rad(15.0))
 
 
-def test_an_inner_corner_without_room_for_the_cartridge_is_refused():
-    """On the desired path itself the cartridge is 0.03 mm in the wall, between two of the coarse stations."""
-    corner, lean = [[-0.1, 0, 0], [0, 0, 0], [0, 0.1, 0]], np.array([0, -1, 1]) * np.sqrt(0.5)
-    corner = np.array(corner) * [1, -1, 1]  # to the right, with the wall on the left
-    wide = Workpiece.from_polyline(corner, lean, corner_radius=0.030)
-    place = reach(wide).part_pose
-    pose = (*place[:3, 3], float(np.arctan2(place[1, 0], place[0, 0])))
-    with pytest.raises(SeamError, match=r"gun/col_cartridge and col_part|col_part_.* and gun/col_cartridge"):
-        reach(Workpiece.from_polyline(corner, lean, corner_radius=0.020, pose=pose))
+def hollow(radius: float, wall: float, turn_deg: float = 90.0) -> Workpiece:
+    """A corner to the right with the wall on the left: the gun is in it."""
+    turn = np.deg2rad(turn_deg)
+    points = 0.08 * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [np.cos(turn), -np.sin(turn), 0.0]])
+    middle = np.array([np.sin(turn / 2), np.cos(turn / 2), 0.0])
+    out = np.array([[0.0, 1.0, 0.0], middle, [np.sin(turn), np.cos(turn), 0.0]])
+    return Workpiece.from_polyline(
+        points, R * (UP - out), corner_radius=radius, wall_height=wall, name="corner"
+    )
+
+
+@pytest.mark.parametrize(("radius", "wall"), [(0.015, 0.03), (0.02, 0.03), (0.02, 0.04)])
+def test_an_inner_corner_without_room_for_the_cartridge_is_refused(radius: float, wall: float) -> None:
+    with pytest.raises(
+        SeamError, match=r"no room: gun/col_cartridge and col_part_.* at .. mm along the seam"
+    ):
+        reach(hollow(radius, wall))
+    reach(hollow(0.03, wall))
+
+
+def test_the_gun_needs_room_to_swing_where_the_seam_turns() -> None:
+    """On the path itself the side camera passes 0.5 mm from the wall; 1.5 deg at 100 mm are 2.6 mm."""
+    with pytest.raises(SeamError, match=r"col_camera_side.*swung by 1.5 deg"):
+        reach(hollow(0.015, 0.025))
+    reach(hollow(0.02, 0.025))  # 2.4 mm there, and 1.1 deg
+
+
+@pytest.mark.parametrize("radius", [0.005, 0.008, 0.0149])
+@pytest.mark.parametrize("turn", [20.0, 60.0])
+def test_a_hollow_bend_too_tight_to_follow_is_refused(radius: float, turn: float) -> None:
+    at = round(80.0 - 1e3 * radius * np.tan(np.deg2rad(turn / 2)))
+    message = rf"hollow bend at {at} mm along the seam has a radius of {1e3 * radius:.1f} mm.* 15 mm or more"
+    with pytest.raises(SeamError, match=message):
+        reach(hollow(radius, 0.03, turn))
+    reach(hollow(0.015, 0.03, turn))
+
+
+def test_a_groove_has_no_hollow_side() -> None:
+    points = [[-0.08, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.08, 0.0]]
+    reach(Workpiece.from_polyline(points, UP, joint="groove", corner_radius=5e-3))
+
+
+def test_a_bend_that_needs_too_fast_joints_is_refused() -> None:
+    """Round this corner the servos' lag took the expert's mouth into the plate, trial after trial."""
+    turn = np.deg2rad(94.0)
+    points = 0.09 * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [np.cos(turn), np.sin(turn), 0.0]])
+    middle = np.array([np.sin(turn / 2), -np.cos(turn / 2), 0.0])
+    out = np.array([[0.0, -1.0, 0.0], middle, [np.sin(turn), -np.cos(turn), 0.0]])
+    place = (0.529, 0.204, 0.0, -0.918)
+
+    def corner(radius: float) -> Workpiece:
+        return Workpiece.from_polyline(points, R * (UP + out), corner_radius=radius, pose=place)
+
+    with pytest.raises(SeamError, match=r"turn at \d\.\d rad/s together at (8|9)\d mm along the seam"):
+        reach(corner(4.2e-3))
+    # The tip path is 2.1 mm outside the seam; the joints' speeds go with the inverse of its radius.
+    wide, wider = reach(corner(15e-3)).joint_speed, reach(corner(30e-3)).joint_speed
+    assert wide / wider == pytest.approx((30 + 2.12) / (15 + 2.12), rel=0.15)
+
+
+@pytest.mark.parametrize(("radius", "wall"), [(0.02, 0.025), (0.03, 0.04)])
+def test_a_seam_that_the_wall_ahead_hides_cannot_be_sealed_by_vision(radius: float, wall: float) -> None:
+    scene = build_scene(hollow(radius, wall), load_cell())
+    check_reach(scene, SHIFT_M, YAW_RAD)
+    with pytest.raises(SeamError, match=r"by vision: .* hides the seam from the front camera at (4|5)\d mm"):
+        check_reach(scene, SHIFT_M, YAW_RAD, by_vision=True)
+    check_reach(build_scene(hollow(0.03, 0.03), load_cell()), SHIFT_M, YAW_RAD, by_vision=True)
+
+
+@pytest.mark.parametrize("name", catalogue.NAMES)
+def test_both_cameras_see_the_nominal_seams(name: str) -> None:
+    check_reach(build_scene(catalogue.get(name), load_cell()), SHIFT_M, YAW_RAD, by_vision=True)
