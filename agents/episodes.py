@@ -1,0 +1,393 @@
+"""Episodes of the expert under disturbances, with what it would do at every state (Zhou et al., 4.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from agents.expert import RmpExpert
+from seal_gym.core.cell import CellCfg
+from seal_gym.core.errors import is_number, require
+from seal_gym.core.frames import Array, yaw_pose
+from seal_gym.envs.adapters import ArmState, make_adapter
+from seal_gym.envs.config import SealCfg
+from seal_gym.envs.core import SealCore
+from seal_gym.rmp import SealingCfg
+from seal_gym.workpieces.catalogue import NAMES
+
+MAX_SEED = 500_000
+"""Seeds from here on are for tuning and for published tables."""
+TWIST = 6
+X, Z, ABOUT_X, ABOUT_Z = _AXES = (0, 2, 3, 5)
+_MM = 1e3
+# Streams of random numbers of an episode besides the environment's own, which takes the seed itself.
+_OFFSETS, _TURNS = 1, 2
+
+
+def _range(cfg: Any, name: str, low: float, high: float) -> None:
+    value = getattr(cfg, name)
+    require(
+        isinstance(value, tuple)
+        and len(value) == 2
+        and all(map(is_number, value))
+        and low <= value[0] <= value[1] <= high,
+        f"{type(cfg).__name__}.{name} = {value!r}: must be (lowest, highest), both within {low:g}..{high:g}",
+    )
+
+
+def _within(cfg: Any, name: str, high: float) -> None:
+    value = getattr(cfg, name)
+    require(
+        is_number(value) and 0 <= value <= high,
+        f"{type(cfg).__name__}.{name} = {value!r}: must be a number within 0..{high:g}; check the unit",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TurnCfg:
+    """Turns of the part about the nozzle, which look to the gun as a corner does. Not in the paper.
+
+    Flat and cylinder never turn faster under the tip than 8 deg/s; a corner of 5 mm radius turns at 115 deg/s.
+
+    Attributes:
+        angle_rad: Largest angle of the part from where it lay at first [rad].
+        rate_rad_s: Range of the speed of a turn [rad/s].
+        pause_s: Range of the time between two turns [s].
+    """
+
+    angle_rad: float = float(np.deg2rad(25.0))
+    rate_rad_s: tuple[float, float] = (float(np.deg2rad(20.0)), float(np.deg2rad(120.0)))
+    pause_s: tuple[float, float] = (0.5, 2.0)
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        _within(self, "angle_rad", float(np.pi / 4))
+        _range(self, "rate_rad_s", 1e-3, 10.0)
+        _range(self, "pause_s", 0.0, 60.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectCfg:
+    """How demonstrations are randomised; the defaults are the paper's (Zhou et al., 4.2).
+
+    Contrast, brightness and the sensor's noise are the environment's own (``LookCfg``).
+
+    Attributes:
+        offset_m_s: Largest velocity offset of the gun along the tip's x and z [m/s].
+        rate_rad_s: Largest rotation rate of the gun about the tip's x and z [rad/s].
+        duration_s: Range of the time an offset lasts [s].
+        drift_m: Largest drift towards wall and plate that the offsets on x and z may settle at together [m];
+            see ``offsets``.
+        workpieces: Parts, taken in turn by successive episodes.
+        turns: Turns of the part; None: it stands still, as in the paper.
+    """
+
+    offset_m_s: float = 0.01
+    rate_rad_s: float = float(np.deg2rad(10.0))
+    duration_s: tuple[float, float] = (0.3, 1.0)
+    drift_m: float = 0.9e-3
+    workpieces: tuple[str, ...] = ("flat", "cylinder")
+    turns: TurnCfg | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        _within(self, "offset_m_s", 0.1)
+        _within(self, "rate_rad_s", 5.0)
+        _within(self, "drift_m", 0.1)
+        _range(self, "duration_s", 0.05, 60.0)
+        require(
+            len(self.workpieces) > 0 and set(self.workpieces) <= set(NAMES),
+            f"CollectCfg.workpieces = {self.workpieces!r}: must be at least one of {list(NAMES)}",
+        )
+
+    @classmethod
+    def wide(cls) -> Self:
+        """Rates up to 40 deg/s and turns of the part: headings and turning speeds as corners have them.
+
+        Returns:
+            The configuration of ``--wide``, on the same parts as the paper's.
+        """
+        return cls(rate_rad_s=float(np.deg2rad(40.0)), turns=TurnCfg())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """Episodes that run side by side; a job's unit.
+
+    Attributes:
+        indices: Numbers of the episodes, all on one part.
+        seed: Seed of episode 0; episode k has seed + k.
+        cfg: The randomisation.
+    """
+
+    indices: tuple[int, ...]
+    seed: int = 0
+    cfg: CollectCfg = field(default_factory=CollectCfg)
+
+    @property
+    def workpiece(self) -> str:
+        """The part of these episodes."""
+        return part_of(self.indices[0], self.cfg)
+
+
+class Episode(NamedTuple):
+    """What happened in T steps, and what the expert would have done.
+
+    Attributes:
+        index: Number of the episode.
+        observations: As the environment gives them, before each step and at the end, shape (T + 1, 35).
+        tip: The expert's tip acceleration as ``control="tip"`` takes it, shape (T, 6).
+        rmp: The expert's (f, A) as ``control="rmp"`` takes it, shape (T, 27).
+        rewards: Shape (T,).
+        terminations: Shape (T,).
+        truncations: Shape (T,).
+        offset: Twist offset in the tip frame during each step, then zeros, shape (T + 1, 6), m/s and rad/s.
+        tip_error_mm: True distance from the desired path, shape (T + 1,), mm.
+        info: Seed, part and the episode's metrics.
+    """
+
+    index: int
+    observations: NDArray[np.float32]
+    tip: NDArray[np.float32]
+    rmp: NDArray[np.float32]
+    rewards: Array
+    terminations: NDArray[np.bool_]
+    truncations: NDArray[np.bool_]
+    offset: NDArray[np.float32]
+    tip_error_mm: NDArray[np.float32]
+    info: dict[str, Any]
+
+
+def part_of(index: int, cfg: CollectCfg) -> str:
+    """The part of an episode.
+
+    Args:
+        index: Number of the episode.
+        cfg: Names the parts.
+
+    Returns:
+        Its name.
+    """
+    return cfg.workpieces[index % len(cfg.workpieces)]
+
+
+def offsets(
+    rng: np.random.Generator, frames: int, frame_s: float, cfg: CollectCfg, settling_s: float
+) -> Array:
+    """Twist offsets of an episode: on x, z, about x and about z, each with steps of its own.
+
+    An offset w settles at a drift of w times ``settling_s``. In a fillet the mouth touches where its drifts
+    |x| - z sum up to about 1.3 mm, so each offset on x or z is uniform over what keeps that sum within
+    ``drift_m``, given the other: nearly the whole range away from the surfaces, less towards them. Drawn
+    without that, the paper's offsets end every episode in contact within seconds.
+
+    Args:
+        rng: Source of the draws.
+        frames: Number of frames.
+        frame_s: Duration of a frame [s].
+        cfg: Ranges of size and duration; durations are rounded to whole frames.
+        settling_s: Drift for each unit of offset [s].
+
+    Returns:
+        Piecewise constant, in the tip frame, shape (frames, 6), m/s and rad/s.
+    """
+    out = np.zeros((frames, TWIST))
+    now, until = np.zeros(TWIST), np.zeros(TWIST, np.int64)
+    bound, rate, room = cfg.offset_m_s, cfg.rate_rad_s, cfg.drift_m / settling_s
+    for t in range(frames):
+        for axis in (a for a in _AXES if until[a] == t):
+            low, high = -rate, rate
+            if axis == X:
+                high = min(bound, room + now[Z])
+                low = -high
+            elif axis == Z:
+                low, high = max(-bound, abs(now[X]) - room), bound
+            now[axis] = rng.uniform(low, high)
+            until[axis] = t + max(1, round(rng.uniform(*cfg.duration_s) / frame_s))
+        out[t] = now
+    return out
+
+
+def turn_angles(rng: np.random.Generator, frames: int, frame_s: float, cfg: TurnCfg) -> Array:
+    """Angles of a part that turns now and then.
+
+    Args:
+        rng: Source of the draws.
+        frames: Number of frames.
+        frame_s: Duration of a frame [s].
+        cfg: Ranges.
+
+    Returns:
+        Angle after each frame, 0 at the start, at most ``angle_rad``, shape (frames,), rad.
+    """
+    pieces: list[Array] = []
+    angle, length = 0.0, 0
+    while length < frames:
+        rest = np.full(max(1, round(rng.uniform(*cfg.pause_s) / frame_s)), angle)
+        goal, rate = rng.uniform(-cfg.angle_rad, cfg.angle_rad), rng.uniform(*cfg.rate_rad_s)
+        steps = max(1, int(np.ceil(abs(goal - angle) / (rate * frame_s))))
+        pieces += [rest, np.linspace(angle, goal, steps + 1)[1:]]
+        angle, length = goal, length + len(rest) + steps
+    return np.concatenate(pieces)[:frames]
+
+
+class DisturbedAdapter:
+    """The ``rmp`` adapter on a gun that drifts.
+
+    The action is resolved with the fixed leaves into the tip acceleration a that the undisturbed gun would
+    have: the label. The gun then executes ``a + c w + dw/dt`` with the offset twist w and the leaves' damping
+    c. That is the motion of an expert whose reference twist is off by w without its knowledge: the tip leaves
+    at w when an offset begins, and the leaves hold it at a drift of c / omega_n^2 w: 1.2 mm for 10 mm/s, 1.2
+    deg for 10 deg/s. Drifting on freely would touch the wall before the shortest offset ends.
+
+    Attributes:
+        label: The last undisturbed tip acceleration, as ``control="tip"`` takes it, shape (N, 6).
+        settling_s: Drift that a lasting offset settles at, for each unit of it [s].
+    """
+
+    size = 27
+
+    def __init__(self, cell: CellCfg, sealing: SealingCfg | None = None) -> None:
+        """Takes the limits.
+
+        Args:
+            cell: The cell.
+            sealing: Configuration of the leaves.
+        """
+        self._rmp, self._tip = make_adapter("rmp", cell, ()), make_adapter("tip", cell, ())
+        sealing = sealing or SealingCfg()
+        self._damping_s = sealing.damping.damping_s
+        self.settling_s = self._damping_s / sealing.attraction.omega_n**2
+        limits = cell.limits
+        self._scale = np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
+        self._frame_s = cell.timing.frame_s
+        self._before = self._now = np.zeros(TWIST)
+        self.label = np.zeros((0, TWIST), np.float32)
+
+    def restart(self) -> None:
+        """Begins new episodes, without an offset."""
+        self._before = self._now = np.zeros(TWIST)
+
+    def drift(self, offset: Array) -> None:
+        """Sets the offset of the next call.
+
+        Args:
+            offset: Twist in the tip frame, shape (N, 6), m/s and rad/s.
+        """
+        self._before, self._now = self._now, offset
+
+    def __call__(self, action: Array, state: ArmState) -> Array:
+        """See ``seal_gym.envs.adapters.Adapter``."""
+        qdd = self._rmp(action, state)
+        accel = (state.tip.jacobian @ qdd[:, :, None])[..., 0] + state.tip.drift
+        self.label = _clipped(accel / self._scale).astype(np.float32)
+        push = self._damping_s * self._now + (self._now - self._before) / self._frame_s
+        return self._tip(_clipped(self.label + push / self._scale), state)
+
+
+def _clipped(action: Array) -> Array:
+    return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0))
+
+
+@lru_cache(maxsize=4)
+def _core(workpiece: str, n: int) -> tuple[SealCore, DisturbedAdapter]:
+    core = SealCore(SealCfg.of(workpiece=workpiece, control="rmp", perception="vision"), n)
+    adapter = DisturbedAdapter(core.cfg.cell)
+    core.adapter = adapter
+    return core, adapter
+
+
+class _Schedule(NamedTuple):
+    """Offsets (N, frames, 6) and angles of the parts (N, frames + 1) of episodes that run side by side."""
+
+    offset: Array
+    angle: Array
+
+
+def _schedule(work: Work, frames: int, frame_s: float, settling_s: float) -> _Schedule:
+    offset, angle = np.zeros((len(work.indices), frames, TWIST)), np.zeros((len(work.indices), frames + 1))
+    for i, k in enumerate(work.indices):
+        offset[i] = offsets(_stream(work.seed + k, _OFFSETS), frames, frame_s, work.cfg, settling_s)
+        if work.cfg.turns is not None:
+            angle[i, 1:] = turn_angles(_stream(work.seed + k, _TURNS), frames, frame_s, work.cfg.turns)
+    return _Schedule(offset, angle)
+
+
+def _stream(seed: int, which: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(which,)))
+
+
+def _turn_part(core: SealCore, i: int, angle: float) -> None:
+    """Turns a part about the vertical through the nozzle mouth."""
+    if angle == 0.0:
+        return
+    x, y, z = core.tip.pose[i, :3, 3]
+    about = yaw_pose(x, y, z, angle) @ yaw_pose(-x, -y, -z, 0.0)
+    core.arm.place_part(i, about @ core.arm.part_pose[i])
+
+
+def run(work: Work) -> list[Episode]:
+    """Runs episodes to their ends, side by side; each comes out the same in any company.
+
+    Args:
+        work: Which episodes.
+
+    Returns:
+        The episodes, in the order of ``work.indices``.
+    """
+    n = len(work.indices)
+    core, adapter = _core(work.workpiece, n)
+    expert = RmpExpert(core.cfg.cell)
+    schedule = _schedule(work, core.time_limit, core.cfg.cell.timing.frame_s, adapter.settling_s)
+    adapter.restart()
+    for i, k in enumerate(work.indices):
+        core.reset(i, seeding.np_random(work.seed + k)[0])
+    seen, errors = [core.observe()], [core.progress.error_m.copy()]
+    rmp, tip, rewards, terminations, truncations = [], [], [], [], []
+    ends = np.zeros(n, np.int64)
+    metrics: list[dict[str, Any]] = [{} for _ in range(n)]
+    for t in range(core.time_limit):
+        rmp.append(expert.predict(seen[t])[0])
+        adapter.drift(schedule.offset[:, t])
+        result = core.step(rmp[t])
+        for i in range(n):
+            _turn_part(core, i, schedule.angle[i, t + 1] - schedule.angle[i, t])
+        seen.append(core.observe())
+        errors.append(core.progress.error_m.copy())
+        tip.append(adapter.label)
+        rewards.append(result.reward)
+        terminations.append(result.terminated)
+        truncations.append(result.timeout)
+        for i in np.flatnonzero((ends == 0) & (result.terminated | result.timeout)):
+            ends[i], metrics[i] = t + 1, core.episode_metrics(int(i), result)
+        if ends.all():
+            break
+    drift = np.pad(schedule.offset, ((0, 0), (0, 1), (0, 0)))
+
+    def cut(rows: Sequence[Any], i: int, last: int, dtype: Any) -> NDArray[Any]:
+        return np.array([row[i] for row in rows[:last]], dtype=dtype)
+
+    episodes = []
+    for i, (k, end) in enumerate(zip(work.indices, ends.tolist(), strict=True)):
+        offset = drift[i, : end + 1].astype(np.float32)
+        offset[end] = 0.0
+        info = {"seed": work.seed + k, "workpiece": work.workpiece, **metrics[i]}
+        episodes.append(
+            Episode(
+                k,
+                cut(seen, i, end + 1, np.float32),
+                cut(tip, i, end, np.float32),
+                cut(rmp, i, end, np.float32),
+                cut(rewards, i, end, np.float64),
+                cut(terminations, i, end, np.bool_),
+                cut(truncations, i, end, np.bool_),
+                offset,
+                (_MM * cut(errors, i, end + 1, np.float64)).astype(np.float32),
+                info,
+            )
+        )
+    return episodes
