@@ -345,9 +345,7 @@ def read_json(path: Path) -> tuple[dict[str, Any], bytes]:
         raise DemonstrationError(
             f"{path}: damaged or no JSON ({error}); delete it and run the collection again"
         ) from None
-    require(
-        isinstance(document, dict), f"{path}: no JSON object; collect the data again", DemonstrationError
-    )
+    require(isinstance(document, dict), f"{path}: no JSON object; collect the data again", DemonstrationError)
     return document, raw
 
 

@@ -10,22 +10,24 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from agents.expert import RmpExpert
-from seal_gym.core.cell import CellCfg
+from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.errors import is_number, require
-from seal_gym.core.frames import Array, yaw_pose
+from seal_gym.core.frames import Array
+from seal_gym.core.kinematics import tip_kinematics
 from seal_gym.envs.adapters import ArmState, make_adapter
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
-from seal_gym.rmp import SealingCfg
+from seal_gym.rmp import SealingCfg, SeamErrors
 from seal_gym.workpieces.catalogue import NAMES
 
 MAX_SEED = 500_000
 """Seeds from here on are for tuning and for published tables."""
 TWIST = 6
 X, Z, ABOUT_X, ABOUT_Z = _AXES = (0, 2, 3, 5)
-_MM = 1e3
-# Streams of random numbers of an episode besides the environment's own, which takes the seed itself.
-_OFFSETS, _TURNS = 1, 2
+DEFAULT_SEALING = SealingCfg()
+SETTLING_S = DEFAULT_SEALING.damping.damping_s / DEFAULT_SEALING.attraction.omega_n**2
+"""Drift that a lasting offset settles at, for each unit of it [s]."""
+_MM, _DEG = 1e3, float(np.rad2deg(1.0))
 
 
 def _range(cfg: Any, name: str, low: float, high: float) -> None:
@@ -48,29 +50,6 @@ def _within(cfg: Any, name: str, high: float) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TurnCfg:
-    """Turns of the part about the nozzle, which look to the gun as a corner does. Not in the paper.
-
-    Flat and cylinder never turn faster under the tip than 8 deg/s; a corner of 5 mm radius turns at 115 deg/s.
-
-    Attributes:
-        angle_rad: Largest angle of the part from where it lay at first [rad].
-        rate_rad_s: Range of the speed of a turn [rad/s].
-        pause_s: Range of the time between two turns [s].
-    """
-
-    angle_rad: float = float(np.deg2rad(25.0))
-    rate_rad_s: tuple[float, float] = (float(np.deg2rad(20.0)), float(np.deg2rad(120.0)))
-    pause_s: tuple[float, float] = (0.5, 2.0)
-
-    def __post_init__(self) -> None:
-        """Checks the ranges."""
-        _within(self, "angle_rad", float(np.pi / 4))
-        _range(self, "rate_rad_s", 1e-3, 10.0)
-        _range(self, "pause_s", 0.0, 60.0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class CollectCfg:
     """How demonstrations are randomised; the defaults are the paper's (Zhou et al., 4.2).
 
@@ -83,7 +62,6 @@ class CollectCfg:
         drift_m: Largest drift towards wall and plate that the offsets on x and z may settle at together [m];
             see ``offsets``.
         workpieces: Parts, taken in turn by successive episodes.
-        turns: Turns of the part; None: it stands still, as in the paper.
     """
 
     offset_m_s: float = 0.01
@@ -91,7 +69,6 @@ class CollectCfg:
     duration_s: tuple[float, float] = (0.3, 1.0)
     drift_m: float = 0.9e-3
     workpieces: tuple[str, ...] = ("flat", "cylinder")
-    turns: TurnCfg | None = None
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
@@ -106,12 +83,12 @@ class CollectCfg:
 
     @classmethod
     def wide(cls) -> Self:
-        """Rates up to 40 deg/s and turns of the part: headings and turning speeds as corners have them.
+        """Beyond the paper: rates up to 40 deg/s, which settle at heading errors of 5 deg.
 
         Returns:
-            The configuration of ``--wide``, on the same parts as the paper's.
+            The configuration of ``--wide``. The drift on x and z is less: a tilted mouth touches earlier.
         """
-        return cls(rate_rad_s=float(np.deg2rad(40.0)), turns=TurnCfg())
+        return cls(rate_rad_s=float(np.deg2rad(40.0)), drift_m=0.5e-3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,29 +152,26 @@ def part_of(index: int, cfg: CollectCfg) -> str:
     return cfg.workpieces[index % len(cfg.workpieces)]
 
 
-def offsets(
-    rng: np.random.Generator, frames: int, frame_s: float, cfg: CollectCfg, settling_s: float
-) -> Array:
+def offsets(rng: np.random.Generator, frames: int, frame_s: float, cfg: CollectCfg) -> Array:
     """Twist offsets of an episode: on x, z, about x and about z, each with steps of its own.
 
-    An offset w settles at a drift of w times ``settling_s``. In a fillet the mouth touches where its drifts
-    |x| - z sum up to about 1.3 mm, so each offset on x or z is uniform over what keeps that sum within
-    ``drift_m``, given the other: nearly the whole range away from the surfaces, less towards them. Drawn
-    without that, the paper's offsets end every episode in contact within seconds.
+    An offset w settles at a drift of c / omega_n^2 w (see ``DisturbedAdapter``). In a fillet the mouth
+    touches where its drifts |x| - z sum up to about 1.3 mm, so each offset on x or z is uniform over what
+    keeps that sum within ``drift_m``, given the other: nearly the whole range away from the surfaces, less
+    towards them. Drawn without that, the paper's offsets end every episode in contact within seconds.
 
     Args:
         rng: Source of the draws.
         frames: Number of frames.
         frame_s: Duration of a frame [s].
         cfg: Ranges of size and duration; durations are rounded to whole frames.
-        settling_s: Drift for each unit of offset [s].
 
     Returns:
         Piecewise constant, in the tip frame, shape (frames, 6), m/s and rad/s.
     """
     out = np.zeros((frames, TWIST))
     now, until = np.zeros(TWIST), np.zeros(TWIST, np.int64)
-    bound, rate, room = cfg.offset_m_s, cfg.rate_rad_s, cfg.drift_m / settling_s
+    bound, rate, room = cfg.offset_m_s, cfg.rate_rad_s, cfg.drift_m / SETTLING_S
     for t in range(frames):
         for axis in (a for a in _AXES if until[a] == t):
             low, high = -rate, rate
@@ -212,27 +186,20 @@ def offsets(
     return out
 
 
-def turn_angles(rng: np.random.Generator, frames: int, frame_s: float, cfg: TurnCfg) -> Array:
-    """Angles of a part that turns now and then.
+def episode_offsets(seed: int, frames: int, cell: CellCfg, cfg: CollectCfg) -> Array:
+    """Twist offsets of the episode with a seed, from random numbers of their own.
 
     Args:
-        rng: Source of the draws.
+        seed: Of the episode.
         frames: Number of frames.
-        frame_s: Duration of a frame [s].
-        cfg: Ranges.
+        cell: Names the frame rate.
+        cfg: The randomisation.
 
     Returns:
-        Angle after each frame, 0 at the start, at most ``angle_rad``, shape (frames,), rad.
+        As ``offsets``.
     """
-    pieces: list[Array] = []
-    angle, length = 0.0, 0
-    while length < frames:
-        rest = np.full(max(1, round(rng.uniform(*cfg.pause_s) / frame_s)), angle)
-        goal, rate = rng.uniform(-cfg.angle_rad, cfg.angle_rad), rng.uniform(*cfg.rate_rad_s)
-        steps = max(1, int(np.ceil(abs(goal - angle) / (rate * frame_s))))
-        pieces += [rest, np.linspace(angle, goal, steps + 1)[1:]]
-        angle, length = goal, length + len(rest) + steps
-    return np.concatenate(pieces)[:frames]
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))  # the environment has the seed
+    return offsets(rng, frames, cell.timing.frame_s, cfg)
 
 
 class DisturbedAdapter:
@@ -246,22 +213,18 @@ class DisturbedAdapter:
 
     Attributes:
         label: The last undisturbed tip acceleration, as ``control="tip"`` takes it, shape (N, 6).
-        settling_s: Drift that a lasting offset settles at, for each unit of it [s].
     """
 
     size = 27
 
-    def __init__(self, cell: CellCfg, sealing: SealingCfg | None = None) -> None:
+    def __init__(self, cell: CellCfg) -> None:
         """Takes the limits.
 
         Args:
             cell: The cell.
-            sealing: Configuration of the leaves.
         """
         self._rmp, self._tip = make_adapter("rmp", cell, ()), make_adapter("tip", cell, ())
-        sealing = sealing or SealingCfg()
-        self._damping_s = sealing.damping.damping_s
-        self.settling_s = self._damping_s / sealing.attraction.omega_n**2
+        self._damping_s = DEFAULT_SEALING.damping.damping_s
         limits = cell.limits
         self._scale = np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
         self._frame_s = cell.timing.frame_s
@@ -289,6 +252,39 @@ class DisturbedAdapter:
         return self._tip(_clipped(self.label + push / self._scale), state)
 
 
+def labels(observations: NDArray[np.float32], cell: CellCfg | None = None) -> dict[str, NDArray[np.float32]]:
+    """What the expert does, in both action spaces, by observations alone: for states that were not simulated.
+
+    ``rmp`` is exactly the expert's action. ``tip`` takes the measured motion for the commanded one, which no
+    observation holds: for collected states it differs from the label there by the servo's lag.
+
+    Args:
+        observations: Shape (n, 35).
+        cell: The cell; by default the nominal one.
+
+    Returns:
+        ``rmp`` (n, 27) and ``tip`` (n, 6), in [-1, 1].
+    """
+    cell = cell or load_cell()
+    o = np.asarray(observations, dtype=np.float64)
+    q, qd = o[:, 23:29], o[:, 29:35]
+    seam = np.zeros((len(o), TWIST))
+    seam[:, [X, Z]], seam[:, [ABOUT_X, ABOUT_Z]] = o[:, 6:8] / _MM, o[:, 8:10] / _DEG
+    state = ArmState(
+        q=q,
+        qd=qd,
+        tip=tip_kinematics(q, qd),
+        errors=SeamErrors(o[:, 0] / _MM, o[:, 1] / _DEG, o[:, 3] / _MM, o[:, 4] / _DEG, o[:, 10] / _DEG),
+        seam_twist=seam,
+        tip_accel=o[:, 17:23],
+        part_pose=np.zeros((len(o), 4, 4)),
+    )
+    adapter = DisturbedAdapter(cell)
+    rmp, _ = RmpExpert(cell).predict(np.asarray(observations, np.float32))
+    adapter(rmp.astype(np.float64), state)
+    return {"rmp": rmp, "tip": adapter.label}
+
+
 def _clipped(action: Array) -> Array:
     return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0))
 
@@ -299,35 +295,6 @@ def _core(workpiece: str, n: int) -> tuple[SealCore, DisturbedAdapter]:
     adapter = DisturbedAdapter(core.cfg.cell)
     core.adapter = adapter
     return core, adapter
-
-
-class _Schedule(NamedTuple):
-    """Offsets (N, frames, 6) and angles of the parts (N, frames + 1) of episodes that run side by side."""
-
-    offset: Array
-    angle: Array
-
-
-def _schedule(work: Work, frames: int, frame_s: float, settling_s: float) -> _Schedule:
-    offset, angle = np.zeros((len(work.indices), frames, TWIST)), np.zeros((len(work.indices), frames + 1))
-    for i, k in enumerate(work.indices):
-        offset[i] = offsets(_stream(work.seed + k, _OFFSETS), frames, frame_s, work.cfg, settling_s)
-        if work.cfg.turns is not None:
-            angle[i, 1:] = turn_angles(_stream(work.seed + k, _TURNS), frames, frame_s, work.cfg.turns)
-    return _Schedule(offset, angle)
-
-
-def _stream(seed: int, which: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(which,)))
-
-
-def _turn_part(core: SealCore, i: int, angle: float) -> None:
-    """Turns a part about the vertical through the nozzle mouth."""
-    if angle == 0.0:
-        return
-    x, y, z = core.tip.pose[i, :3, 3]
-    about = yaw_pose(x, y, z, angle) @ yaw_pose(-x, -y, -z, 0.0)
-    core.arm.place_part(i, about @ core.arm.part_pose[i])
 
 
 def run(work: Work) -> list[Episode]:
@@ -342,20 +309,19 @@ def run(work: Work) -> list[Episode]:
     n = len(work.indices)
     core, adapter = _core(work.workpiece, n)
     expert = RmpExpert(core.cfg.cell)
-    schedule = _schedule(work, core.time_limit, core.cfg.cell.timing.frame_s, adapter.settling_s)
+    schedule = np.zeros((n, core.time_limit + 1, TWIST))
     adapter.restart()
     for i, k in enumerate(work.indices):
         core.reset(i, seeding.np_random(work.seed + k)[0])
+        schedule[i, :-1] = episode_offsets(work.seed + k, core.time_limit, core.cfg.cell, work.cfg)
     seen, errors = [core.observe()], [core.progress.error_m.copy()]
     rmp, tip, rewards, terminations, truncations = [], [], [], [], []
     ends = np.zeros(n, np.int64)
     metrics: list[dict[str, Any]] = [{} for _ in range(n)]
     for t in range(core.time_limit):
         rmp.append(expert.predict(seen[t])[0])
-        adapter.drift(schedule.offset[:, t])
+        adapter.drift(schedule[:, t])
         result = core.step(rmp[t])
-        for i in range(n):
-            _turn_part(core, i, schedule.angle[i, t + 1] - schedule.angle[i, t])
         seen.append(core.observe())
         errors.append(core.progress.error_m.copy())
         tip.append(adapter.label)
@@ -366,14 +332,13 @@ def run(work: Work) -> list[Episode]:
             ends[i], metrics[i] = t + 1, core.episode_metrics(int(i), result)
         if ends.all():
             break
-    drift = np.pad(schedule.offset, ((0, 0), (0, 1), (0, 0)))
 
     def cut(rows: Sequence[Any], i: int, last: int, dtype: Any) -> NDArray[Any]:
         return np.array([row[i] for row in rows[:last]], dtype=dtype)
 
     episodes = []
     for i, (k, end) in enumerate(zip(work.indices, ends.tolist(), strict=True)):
-        offset = drift[i, : end + 1].astype(np.float32)
+        offset = schedule[i, : end + 1].astype(np.float32)
         offset[end] = 0.0
         info = {"seed": work.seed + k, "workpiece": work.workpiece, **metrics[i]}
         episodes.append(
