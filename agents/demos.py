@@ -128,12 +128,11 @@ def write_episode(data: Path, episode: Episode) -> None:
     """
     content = _shard(episode)
     metadata = {
-        "id": episode.index,
-        "total_steps": len(episode.rewards),
+        "id": episode.number,
         **episode.info,
         "sha256": hashlib.sha256(content).hexdigest(),
     }
-    draft, final = data / f".{episode.index}.new", data / str(episode.index)
+    draft, final = data / f".{episode.number}.new", data / str(episode.number)
     for old in (draft, final):
         shutil.rmtree(old, ignore_errors=True)
     draft.mkdir()
@@ -362,11 +361,10 @@ def _dataset_metadata(data: Path) -> dict[str, Any]:
     path = data / _METADATA
     document, _ = read_json(path)
     ours = document.get("seal_gym")
-    require(
-        isinstance(ours, dict) and document.get("data_format") == "arrow",
-        f"{path}: a dataset, but not of agents.collect; collect one with python -m agents.collect",
-        DemonstrationError,
-    )
+    if not isinstance(ours, dict) or document.get("data_format") != "arrow":
+        raise DemonstrationError(
+            f"{path}: a dataset, but not of agents.collect; collect one with python -m agents.collect"
+        )
     require(
         ours.get("format") == FORMAT,
         f"{path}: format {ours.get('format')!r}, this version reads {FORMAT}; collect the data again",

@@ -1,6 +1,5 @@
 """Episodes of the expert under disturbances, with what it would do at every state (Zhou et al., 4.2)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple, Self
@@ -16,7 +15,7 @@ from seal_gym.core.frames import Array
 from seal_gym.core.kinematics import tip_kinematics
 from seal_gym.envs.adapters import ArmState, make_adapter
 from seal_gym.envs.config import SealCfg
-from seal_gym.envs.core import SealCore
+from seal_gym.envs.core import SealCore, StepResult
 from seal_gym.rmp import SealingCfg, SeamErrors
 from seal_gym.workpieces.catalogue import NAMES
 
@@ -115,7 +114,7 @@ class Episode(NamedTuple):
     """What happened in T steps, and what the expert would have done.
 
     Attributes:
-        index: Number of the episode.
+        number: Of the episode.
         observations: As the environment gives them, before each step and at the end, shape (T + 1, 35).
         tip: The expert's tip acceleration as ``control="tip"`` takes it, shape (T, 6).
         rmp: The expert's (f, A) as ``control="rmp"`` takes it, shape (T, 27).
@@ -127,7 +126,7 @@ class Episode(NamedTuple):
         info: Seed, part and the episode's metrics.
     """
 
-    index: int
+    number: int
     observations: NDArray[np.float32]
     tip: NDArray[np.float32]
     rmp: NDArray[np.float32]
@@ -297,6 +296,38 @@ def _core(workpiece: str, n: int) -> tuple[SealCore, DisturbedAdapter]:
     return core, adapter
 
 
+class _Frame(NamedTuple):
+    """A step of N episodes: what the expert would do, what was done to the gun, what came of it."""
+
+    rmp: NDArray[np.float32]
+    tip: NDArray[np.float32]
+    offset: Array
+    result: StepResult
+
+
+class _View(NamedTuple):
+    """What N episodes show between two steps: the observations, and the true tip error [m]."""
+
+    observation: NDArray[np.float32]
+    error_m: Array
+
+
+def _look(core: SealCore) -> _View:
+    observation = core.observe()
+    assert isinstance(observation, np.ndarray)
+    return _View(observation, core.progress.error_m.copy())
+
+
+def _begin(work: Work, core: SealCore, adapter: DisturbedAdapter) -> Array:
+    """Resets all rows, as an environment does with these seeds, and draws their offsets (N, frames, 6)."""
+    adapter.restart()
+    for i, k in enumerate(work.indices):
+        core.reset(i, seeding.np_random(work.seed + k)[0])
+    return np.array(
+        [episode_offsets(work.seed + k, core.time_limit, core.cfg.cell, work.cfg) for k in work.indices]
+    )
+
+
 def run(work: Work) -> list[Episode]:
     """Runs episodes to their ends, side by side; each comes out the same in any company.
 
@@ -306,53 +337,39 @@ def run(work: Work) -> list[Episode]:
     Returns:
         The episodes, in the order of ``work.indices``.
     """
-    n = len(work.indices)
-    core, adapter = _core(work.workpiece, n)
-    expert = RmpExpert(core.cfg.cell)
-    schedule = np.zeros((n, core.time_limit + 1, TWIST))
-    adapter.restart()
-    for i, k in enumerate(work.indices):
-        core.reset(i, seeding.np_random(work.seed + k)[0])
-        schedule[i, :-1] = episode_offsets(work.seed + k, core.time_limit, core.cfg.cell, work.cfg)
-    seen, errors = [core.observe()], [core.progress.error_m.copy()]
-    rmp, tip, rewards, terminations, truncations = [], [], [], [], []
-    ends = np.zeros(n, np.int64)
-    metrics: list[dict[str, Any]] = [{} for _ in range(n)]
-    for t in range(core.time_limit):
-        rmp.append(expert.predict(seen[t])[0])
-        adapter.drift(schedule[:, t])
-        result = core.step(rmp[t])
-        seen.append(core.observe())
-        errors.append(core.progress.error_m.copy())
-        tip.append(adapter.label)
-        rewards.append(result.reward)
-        terminations.append(result.terminated)
-        truncations.append(result.timeout)
-        for i in np.flatnonzero((ends == 0) & (result.terminated | result.timeout)):
-            ends[i], metrics[i] = t + 1, core.episode_metrics(int(i), result)
-        if ends.all():
-            break
+    core, adapter = _core(work.workpiece, len(work.indices))
+    expert, schedule = RmpExpert(core.cfg.cell), _begin(work, core, adapter)
+    views: list[_View] = [_look(core)]
+    frames: list[_Frame] = []
+    ended: dict[int, dict[str, Any]] = {}
+    while len(ended) < core.n:
+        offset = schedule[:, len(frames)]
+        rmp, _ = expert.predict(views[-1].observation)
+        adapter.drift(offset)
+        result = core.step(rmp)
+        frames.append(_Frame(rmp, adapter.label, offset, result))
+        views.append(_look(core))
+        for i in map(int, np.flatnonzero(result.terminated | result.timeout)):
+            ended.setdefault(i, {"total_steps": len(frames), **core.episode_metrics(i, result)})
+    return [_episode(work, i, views, frames, ended[i]) for i in range(core.n)]
 
-    def cut(rows: Sequence[Any], i: int, last: int, dtype: Any) -> NDArray[Any]:
-        return np.array([row[i] for row in rows[:last]], dtype=dtype)
 
-    episodes = []
-    for i, (k, end) in enumerate(zip(work.indices, ends.tolist(), strict=True)):
-        offset = schedule[i, : end + 1].astype(np.float32)
-        offset[end] = 0.0
-        info = {"seed": work.seed + k, "workpiece": work.workpiece, **metrics[i]}
-        episodes.append(
-            Episode(
-                k,
-                cut(seen, i, end + 1, np.float32),
-                cut(tip, i, end, np.float32),
-                cut(rmp, i, end, np.float32),
-                cut(rewards, i, end, np.float64),
-                cut(terminations, i, end, np.bool_),
-                cut(truncations, i, end, np.bool_),
-                offset,
-                (_MM * cut(errors, i, end + 1, np.float64)).astype(np.float32),
-                info,
-            )
-        )
-    return episodes
+def _episode(
+    work: Work, i: int, views: list[_View], frames: list[_Frame], metrics: dict[str, Any]
+) -> Episode:
+    """One row of what was recorded, up to its end."""
+    steps, number = metrics["total_steps"], work.indices[i]
+    frames, views = frames[:steps], views[: steps + 1]
+    offset = np.array([f.offset[i] for f in frames] + [np.zeros(TWIST)], np.float32)
+    return Episode(
+        number=number,
+        observations=np.array([v.observation[i] for v in views]),
+        tip=np.array([f.tip[i] for f in frames]),
+        rmp=np.array([f.rmp[i] for f in frames]),
+        rewards=np.array([f.result.reward[i] for f in frames]),
+        terminations=np.array([f.result.terminated[i] for f in frames]),
+        truncations=np.array([f.result.timeout[i] for f in frames]),
+        offset=offset,
+        tip_error_mm=np.array([_MM * v.error_m[i] for v in views], np.float32),
+        info={"seed": work.seed + number, "workpiece": work.workpiece, **metrics},
+    )
