@@ -283,21 +283,21 @@ def _minari(meta: dict[str, Any]) -> dict[str, Any]:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Holds a folder for one collection at a time; the lock ends with the process, however it ends."""
-    with (out / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ConfigError(f"--out {out}: another collection is writing there; wait for it") from None
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
+    except BlockingIOError:
+        raise ConfigError(f"--out {out}: another collection is writing there; wait for it") from None
+    finally:
+        os.close(folder)
 
 
 def _begin(out: Path, wanted: dict[str, Any]) -> dict[str, Any]:
     """Starts a collection, or checks that this is the one that was started here."""
     path = out / _PLAN
     if not path.exists():
-        others = sorted(
-            f.name for f in out.iterdir() if f.name != ".lock" and not f.name.startswith(f".{_PLAN}")
-        )
+        others = sorted(f.name for f in out.iterdir() if not f.name.startswith(f".{_PLAN}"))
         require(not others, f"--out {out}: holds {others[:3]} but no {_PLAN}: choose an empty folder")
         demos.write_json(path, wanted)
         return wanted

@@ -247,7 +247,8 @@ class DisturbedAdapter:
         qdd = self._rmp(action, state)
         accel = (state.tip.jacobian @ qdd[:, :, None])[..., 0] + state.tip.drift
         self.label = _clipped(accel / self._scale).astype(np.float32)
-        push = self._damping_s * self._now + (self._now - self._before) / self._frame_s
+        # The label sees the drift of the frame before, and damps that.
+        push = self._damping_s * self._before + (self._now - self._before) / self._frame_s
         return self._tip(_clipped(self.label + push / self._scale), state)
 
 
