@@ -249,7 +249,7 @@ class DisturbedAdapter:
         self.label = _clipped(accel / self._scale).astype(np.float32)
         # The label sees the drift of the frame before, and damps that.
         push = self._damping_s * self._before + (self._now - self._before) / self._frame_s
-        return self._tip(_clipped(self.label + push / self._scale), state)
+        return self._tip((accel + push) / self._scale, state)
 
 
 def labels(observations: NDArray[np.float32], cell: CellCfg | None = None) -> dict[str, NDArray[np.float32]]:
