@@ -9,12 +9,10 @@ whatever the number of jobs, the batch or the engine.
 
 import argparse
 import fcntl
-import hashlib
 import json
 import multiprocessing
 import multiprocessing.connection
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -22,32 +20,21 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from gymnasium import spaces
 from tqdm import tqdm
 
-from agents import demos, episodes
+from agents import demos, episodes, remote
 from agents.episodes import MAX_SEED, CollectCfg, Episode, Work
+from agents.provenance import ROOT, code_hash, commit, stack
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
 from seal_gym.sim.look import LookCfg
 from seal_gym.tasks.progress import SealTaskCfg
 
-_ROOT = Path(__file__).resolve().parents[1]
-_PACKAGES = (
-    "seal-gym",
-    "gymnasium",
-    "mujoco",
-    "numpy",
-    "numba",
-    "scipy",
-    "opencv-python-headless",
-    "filterpy",
-)
 _PLAN = "collect.json"
 _SAME = ("seed", "config", "code", "stack")  # what a collection must have in common with its continuation
 _RETRIES = 10
@@ -57,41 +44,6 @@ Engine = Callable[[list[Work]], Iterator[list[Episode]]]
 
 
 # -- what is collected ----------------------------------------------------------------------------------
-
-
-def code_hash() -> str:
-    """Hash of all code and assets that decide the data.
-
-    Returns:
-        16 hexadecimal digits.
-    """
-    digest = hashlib.sha256()
-    files = [
-        f
-        for d in ("seal_gym", "assets")
-        for f in (_ROOT / d).rglob("*")
-        if f.suffix in (".py", ".xml", ".toml")
-    ]
-    for file in sorted([*files, _ROOT / "agents" / "expert.py", _ROOT / "agents" / "episodes.py"]):
-        digest.update(str(file.relative_to(_ROOT)).encode() + b"\0" + file.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
-
-
-def _stack() -> dict[str, str]:
-    found = {"python": sys.version.split()[0]}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue  # a checkout that is not installed
-    return found
-
-
-def _commit() -> str | None:
-    run = subprocess.run(
-        ["git", "-C", str(_ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return run.stdout.strip() if run.returncode == 0 else None
 
 
 def plan(count: int, seed: int, cfg: CollectCfg) -> dict[str, Any]:
@@ -125,9 +77,9 @@ def plan(count: int, seed: int, cfg: CollectCfg) -> dict[str, Any]:
         "episodes": count,
         "seed": seed,
         "config": json.loads(json.dumps(config)),  # tuples as JSON has them, to compare
-        "stack": _stack(),
+        "stack": stack(),
         "code": code_hash(),
-        "git_commit": _commit(),
+        "git_commit": commit(),
     }
 
 
@@ -200,12 +152,14 @@ def run_locally(jobs: int) -> Engine:
     return engine
 
 
-def run_on_ray(jobs: int, address: str | None) -> Engine:
+def run_on_ray(jobs: int, address: str | None, send_code: bool = False) -> Engine:
     """Runs units on a Ray cluster; what a lost worker or node was on runs again elsewhere.
 
     Args:
         jobs: Processors of the cluster that is started on this machine if there is no address.
-        address: Of a running cluster, whose nodes get this checkout's code sent.
+        address: Of a running cluster.
+        send_code: Whether the nodes get the code from here, and compile it; else each has this checkout at
+            the same path. A node with other code is refused.
 
     Returns:
         The engine.
@@ -217,28 +171,31 @@ def run_on_ray(jobs: int, address: str | None) -> Engine:
         import ray
     except ImportError:
         raise ConfigError("--engine ray: Ray is not installed: pip install 'seal-gym[ray]'") from None
-    code: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
-    start: dict[str, Any] = {"log_to_driver": False}
-    if address is not None:
-        code |= {"working_dir": str(_ROOT), "excludes": list(_NOT_SENT)}
+    environment: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
+    if send_code:
+        environment |= {"working_dir": str(ROOT), "excludes": list(_NOT_SENT)}
     else:
-        # On this machine the code is here, and so is the cache of its compiled kernels.
-        code["env_vars"]["PYTHONPATH"] = str(_ROOT)
-        start |= {"num_cpus": jobs, "include_dashboard": False}
+        environment["env_vars"]["PYTHONPATH"] = str(ROOT)
+    start: dict[str, Any] = {} if address is not None else {"num_cpus": jobs, "include_dashboard": False}
     try:
-        ray.init(address=address, runtime_env=code, **start)
+        ray.init(address=address, runtime_env=environment, log_to_driver=False, **start)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ConfigError(
             f"--address {address}: no Ray cluster there ({error}); start one with ray start --head"
         ) from None
 
     def engine(units: list[Work]) -> Iterator[list[Episode]]:
-        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(episodes.run)
-        waiting = [task.remote(w) for w in units]
+        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(remote.run_checked)
+        code = code_hash()
+        waiting = [task.remote(w, code) for w in units]
         try:
             while waiting:
                 done, waiting = ray.wait(waiting, num_returns=1)
                 yield ray.get(done[0])
+        except ray.exceptions.RayError as error:
+            raise SealGymError(
+                f"the Ray cluster failed: {error}\nstart the same command again; it goes on where it stopped"
+            ) from None
         finally:
             ray.shutdown()
 
@@ -389,11 +346,20 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--address", help="of a running Ray cluster; without one, --jobs workers on this machine")
     p.add_argument(
+        "--send-code",
+        action="store_true",
+        help="send the code to the cluster's nodes; else each has this checkout at the same path",
+    )
+    p.add_argument(
         "--wide",
         action="store_true",
         help="beyond the paper: rotation rates up to 40 deg/s, not 10, for larger heading errors",
     )
     return p
+
+
+def _ray(args: argparse.Namespace) -> Engine:
+    return run_on_ray(args.jobs, args.address, args.send_code)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -409,11 +375,11 @@ def main(arguments: list[str] | None = None) -> int:
     cfg = CollectCfg.wide() if args.wide else CollectCfg()
     try:
         require(
-            args.engine == "ray" or args.address is None,
-            f"--address {args.address}: only --engine ray has one",
+            args.engine == "ray" or (args.address is None and not args.send_code),
+            "--address and --send-code: only with --engine ray",
         )
         wanted = plan(args.episodes, args.seed, cfg)
-        engine = run_on_ray(args.jobs, args.address) if args.engine == "ray" else run_locally(args.jobs)
+        engine = _ray(args) if args.engine == "ray" else run_locally(args.jobs)
         steps = collect(args.out, wanted, cfg, engine, args.batch)
     except SealGymError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -12,7 +12,7 @@ import pytest
 from scipy import stats
 
 import seal_gym  # noqa: F401  # registers the ids
-from agents import collect, demos, episodes
+from agents import collect, demos, episodes, remote
 from agents.episodes import CollectCfg, DisturbedAdapter, Work
 from agents.expert import RmpExpert
 from seal_gym.core.errors import ConfigError
@@ -320,7 +320,8 @@ def test_two_collections_do_not_write_into_one_folder(tmp_path):
     ("arguments", "message"),
     [
         (["--seed", "499999", "--episodes", "2"], "--seed 499999.*training seeds are 0..499999"),
-        (["--address", "auto"], "--address auto: only --engine ray"),
+        (["--address", "auto"], "--address and --send-code: only with --engine ray"),
+        (["--send-code"], "--address and --send-code: only with --engine ray"),
     ],
 )
 def test_wrong_arguments_are_explained(tmp_path, capsys, arguments, message):
@@ -370,6 +371,11 @@ status = collect.main(
 print("status", status, flush=True)
 cluster.shutdown()
 """
+
+
+def test_a_node_with_other_code_is_refused():
+    with pytest.raises(ConfigError, match=r"this node's code .* is not the collection's \(0123\)"):
+        remote.run_checked(Work(indices=(0,)), "0123")
 
 
 @pytest.mark.slow
