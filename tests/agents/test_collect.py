@@ -385,7 +385,12 @@ def test_on_a_ray_cluster_that_loses_a_worker_the_files_are_the_same(reference, 
     run = subprocess.run(
         [sys.executable, "-c", RAY, str(out)],
         cwd=ROOT,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"},
+        env={
+            **os.environ,
+            "OMP_NUM_THREADS": "1",
+            "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_raylet_start_wait_time_s": "300",  # starting takes longer where others compute too
+        },
         capture_output=True,
         text=True,
         timeout=1500,
