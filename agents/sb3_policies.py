@@ -24,6 +24,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor, nn
 
+from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import ConfigError, require
 from seal_gym.envs.adapters import RmpAdapter, TipAdapter
 
@@ -136,14 +137,31 @@ def first_action(cfg: NetCfg) -> NDArray[np.float32]:
     return action
 
 
-class Scale(nn.Module):
-    """The first 23 observation rows in natural units, clipped to +-10."""
+def _relative() -> tuple[Tensor, Tensor]:
+    """What makes the tip's motion that against the seam at nominal speed: x @ matrix - offset."""
+    matrix, offset = torch.eye(len(SCALES)), torch.zeros(len(SCALES))
+    for seam, tip in ((6, 11), (7, 13), (8, 14), (9, 16)):
+        matrix[seam, tip] = -1.0
+    offset[12] = 1e3 * load_cell().process.speed_m_s
+    return matrix, offset
 
-    scales: Tensor
+
+class Scale(nn.Module):
+    """The first 23 observation rows in natural units, clipped to +-10.
+
+    The tip's velocities are taken against the seam's own and, along y, against the nominal speed: zero is
+    where the gun should be.
+    """
+
+    matrix: Tensor
+    offset: Tensor
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("scales", torch.from_numpy(SCALES.copy()), persistent=False)
+        matrix, offset = _relative()
+        scales = torch.from_numpy(SCALES)
+        self.register_buffer("matrix", matrix / scales, persistent=False)
+        self.register_buffer("offset", offset / scales, persistent=False)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Scales.
@@ -154,7 +172,7 @@ class Scale(nn.Module):
         Returns:
             Shape (B, 23).
         """
-        return (observation[:, : len(SCALES)] / self.scales).clamp(-_CLIP, _CLIP)
+        return (observation[:, : len(SCALES)] @ self.matrix - self.offset).clamp(-_CLIP, _CLIP)
 
 
 class ScaledFeatures(BaseFeaturesExtractor):

@@ -138,9 +138,9 @@ class TrainCfg:
 
     env: str = "SealGym/Flat-v0"
     perception: str = "oracle"
-    steps: int = 1_000_000
+    steps: int = 393_216
     seed: int = 0
-    round_steps: int = 98_304
+    round_steps: int = 49_152
     episodes: int = 20
     time_factor: float = 0.4
     reward_scale: float = 0.1
@@ -726,7 +726,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--perception", choices=PERCEPTIONS, default="oracle", help="(default: %(default)s)")
     parser.add_argument(
-        "--steps", type=int, help="frames, of all environments together (default: 1000000; SAC 200000)"
+        "--steps", type=int, help="frames, of all environments together (default: 393216; SAC 200000)"
     )
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--n-envs", type=int, help="environments stepped together (default: 64; SAC 16)")
@@ -762,9 +762,11 @@ def config(options: argparse.Namespace) -> TrainCfg:
     return TrainCfg(
         env=options.env,
         perception=options.perception,
-        steps=options.steps if options.steps is not None else (200_000 if sac else 1_000_000),
+        steps=options.steps if options.steps is not None else (200_000 if sac else TrainCfg.steps),
         seed=options.seed,
-        round_steps=options.round_steps if options.round_steps is not None else (20_000 if sac else 98_304),
+        round_steps=options.round_steps
+        if options.round_steps is not None
+        else (20_000 if sac else TrainCfg.round_steps),
         episodes=options.episodes,
         net=net,
         init=options.init,
