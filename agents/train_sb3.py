@@ -168,8 +168,12 @@ class TrainCfg:
             f"seed = {self.seed}: from {VALIDATION_SEED} on seeds are for validation and tables",
         )
         require(
-            self.ppo.rollout % self.ppo.n_envs == 0,
+            1 <= self.n_envs <= self.ppo.rollout and self.ppo.rollout % self.ppo.n_envs == 0,
             f"n_envs = {self.ppo.n_envs}: must divide the rollout of {self.ppo.rollout} steps",
+        )
+        require(
+            self.init is None or self.net.algo == "ppo",
+            "init with algo = 'sac': a fresh critic would lead SAC astray at once; use --algo ppo",
         )
 
     @property
@@ -383,12 +387,8 @@ def cloned(cfg: TrainCfg) -> Any:
         As ``agents.policies.load`` gives it: ``net`` is the module from observations to actions.
 
     Raises:
-        ConfigError: If the algorithm or the control mode cannot start from it.
+        ConfigError: If the control mode is another.
     """
-    require(
-        cfg.net.algo == "ppo",
-        "init with algo = 'sac': a fresh critic would lead SAC astray at once; use --algo ppo",
-    )
     policy = sb3_policies.cloned_policies().load(Path(cfg.init or ""))
     require(
         policy.control == cfg.net.control,

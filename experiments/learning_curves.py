@@ -1,6 +1,6 @@
 """Learning curves of PPO and SAC: reached share and RMSE over steps, mean and spread of the training seeds.
 
-    python -m agents.train_sb3 --env SealGym/Flat-v0 --control tip --seed 0 --out out/rl/flat_tip_0     # and so on
+    python -m agents.train_sb3 --env SealGym/Flat-v0 --control tip --seed 0 --out out/rl/flat_tip_0  # ...
     python -m experiments.learning_curves --runs out/rl --out experiments/results
 
 Reads every run's folder below ``--runs``, plays random actions, the zero action, the expert and, if given,
@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
+import seal_gym
 from agents.train_sb3 import VALIDATION_SEED, play, summary
 from experiments import results
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.envs.sb3 import make_sb3_vec
 
 mpl.use("Agg")  # no screen needed
-import matplotlib.pyplot as plt  # noqa: E402  # the backend has to be chosen first
+import matplotlib.pyplot as plt  # the backend has to be chosen first
 
 NAME = "learning_curves"
 GOAL_REACHED_PCT, GOAL_RMSE_MM = 90.0, 1.0
@@ -212,8 +213,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     Returns:
         Markdown.
     """
-    head = ("policy", "environment", "control", "seed", "steps", "steps to goal", "reached %", "collision %")
-    head += ("timeout %", "RMSE mm", "time s", "return")
+    head = "policy,environment,control,seed,steps,steps to goal,reached %,collision %,timeout %".split(",")
+    head += ["RMSE mm", "time s", "return"]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for row in rows:
         goal = "-" if row["steps_to_goal"] is None else f"{row['steps_to_goal']:,}"
@@ -228,8 +229,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     lines += [
         "",
         f"Each figure from {episodes} validation episodes (seeds {VALIDATION_SEED:,} on). Goal: at least "
-        f"{GOAL_REACHED_PCT:.0f} % reached at an RMSE of at most {GOAL_RMSE_MM:.0f} mm; RMSE and time over the "
-        "episodes that reached; the last evaluation of each run.",
+        f"{GOAL_REACHED_PCT:.0f} % reached at an RMSE of at most {GOAL_RMSE_MM:.0f} mm; RMSE and time over "
+        "the episodes that reached; the last evaluation of each run.",
     ]
     return "\n".join(lines)
 
@@ -240,17 +241,17 @@ def _curve(run: dict[str, Any], name: str, steps: NDArray[np.float64]) -> NDArra
     return np.asarray(np.interp(steps, [row["step"] for row in rows], values))
 
 
-def draw(path: Path, runs: list[dict[str, Any]], level_rows: list[dict[str, Any]]) -> None:
+def draw(path: Path, runs: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
     """Draws the curves: a column for each environment, reached share above, RMSE below.
 
     Args:
         path: The PNG file.
         runs: From ``read_runs``.
-        level_rows: From ``levels``.
+        rows: From ``table_rows``; those without a training seed are drawn as levels.
     """
-    envs = sorted({run["env"] for run in runs}, key=lambda e: [r["env"] for r in runs].index(e))
-    order = ("SealGym/Flat-v0", "SealGym/Cylinder-v0")
-    envs.sort(key=lambda e: order.index(e) if e in order else len(order))
+    level_rows = [row for row in rows if row["training_seed"] is None]
+    present = {run["env"] for run in runs}
+    envs = [env for env in seal_gym.ENV_IDS if env in present]
     figure, grid = plt.subplots(
         2, len(envs), figsize=(6.2 * len(envs), 7.4), sharex="col", squeeze=False, constrained_layout=True
     )
@@ -291,8 +292,11 @@ def draw(path: Path, runs: list[dict[str, Any]], level_rows: list[dict[str, Any]
             axes.grid(color="#dddddd", lw=0.6)
         if column == 0:
             reached.legend(loc="center right", fontsize=8)
-            reached.text(0.005, GOAL_REACHED_PCT - 1, "goal", color="#2a9d54", va="top", fontsize=8)
-            rmse.text(0.005, GOAL_RMSE_MM, "goal", color="#2a9d54", va="bottom", fontsize=8)
+            for axes, goal in ((reached, GOAL_REACHED_PCT), (rmse, GOAL_RMSE_MM)):
+                place = axes.get_yaxis_transform()
+                axes.text(
+                    0.99, goal, "goal", transform=place, color="#2a9d54", ha="right", va="bottom", fontsize=8
+                )
     figure.suptitle(
         "Learning to seal from scratch: mean and range of the training seeds, on validation seeds",
         fontsize=12,
@@ -377,7 +381,7 @@ def main(arguments: list[str] | None = None) -> int:
             file = options.out / f"{NAME}.json"
             require(file.is_file(), f"{file} not found: give the runs with --runs")
             document = json.loads(file.read_text(encoding="utf-8"))
-            draw(options.out / f"{NAME}.png", document["trials"], document["levels"])
+            draw(options.out / f"{NAME}.png", document["trials"], document["rows"])
             return 0
         runs = read_runs(options.runs)
         episodes = runs[0]["evaluations"][0]["episodes"]
@@ -388,8 +392,7 @@ def main(arguments: list[str] | None = None) -> int:
         text = markdown(rows)
         renderer = "raycast" if any(run["perception"] == "vision" for run in runs) else "none"
         results.write(options.out, NAME, rows, runs, renderer=renderer, regime="static", text=text)
-        _add_levels(options.out / f"{NAME}.json", level_rows)
-        draw(options.out / f"{NAME}.png", runs, level_rows)
+        draw(options.out / f"{NAME}.png", runs, rows)
     except SealGymError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
