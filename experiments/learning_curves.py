@@ -213,7 +213,17 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     Returns:
         Markdown.
     """
-    head = "policy,environment,control,seed,steps,steps to goal,reached %,collision %,timeout %".split(",")
+    head = [
+        "policy",
+        "environment",
+        "control",
+        "seed",
+        "steps",
+        "steps to goal",
+        "reached %",
+        "collision %",
+        "timeout %",
+    ]
     head += ["RMSE mm", "time s", "return"]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for row in rows:
