@@ -29,7 +29,7 @@ are old: the policies of every kind brake until both views are back (``_brake``)
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -119,7 +119,8 @@ class PolicyCfg:
             value = getattr(self, name)
             whole = isinstance(value, int) and not isinstance(value, bool)
             require(
-                whole and 1 <= value <= 1024, f"PolicyCfg.{name} = {value!r}: must be a whole number in 1..1024"
+                whole and 1 <= value <= 1024,
+                f"PolicyCfg.{name} = {value!r}: must be a whole number in 1..1024",
             )
         for name in ("speed_m_s", "linear_m_s2", "angular_rad_s2"):
             value = getattr(self, name)
@@ -211,9 +212,9 @@ class SealNet(nn.Module):
             Shape (N, 27) for ``control="rmp"``, (N, 6) for ``"tip"``.
         """
         inputs = group_inputs(observation, self.cfg.speed_m_s)
-        groups = zip(self.extractors.values(), inputs.split(list(GROUPS.values()), dim=1), strict=True)
+        groups = zip(self.extractors.values(), torch.split(inputs, list(GROUPS.values()), dim=1), strict=True)
         out = self.regressor(torch.cat([extract(group) for extract, group in groups], dim=1))
-        accel = out[:, :ACCELS] + self.linear(inputs)
+        accel: Tensor = out[:, :ACCELS] + self.linear(inputs)
         if self.cfg.kind == "neural_control":
             return accel
         metric = _definite(out[:, ACCELS:]) if self.cfg.kind == "neural_rmp" else _identity(accel)
@@ -242,7 +243,9 @@ class LearnedPolicy:
         card: Where the weights are from; empty for a network that was not loaded.
     """
 
-    def __init__(self, cfg: PolicyCfg, net: SealNet | None = None, card: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, cfg: PolicyCfg, net: SealNet | None = None, card: Mapping[str, Any] | None = None
+    ) -> None:
         """Takes the network.
 
         Args:
@@ -289,7 +292,8 @@ class LearnedPolicy:
         for name in ("speed_m_s", "linear_m_s2", "angular_rad_s2"):
             ours, given = getattr(self.cfg, name), getattr(theirs, name)
             require(
-                ours == given, f"the policy was trained with {name} = {ours}, the cell has {given}: train it anew"
+                ours == given,
+                f"the policy was trained with {name} = {ours}, the cell has {given}: train it anew",
             )
 
     def predict(
@@ -474,9 +478,24 @@ def read_card(path: str | Path) -> dict[str, Any]:
         raise PolicyFileError(f"{file.name} is no card of a policy: it does not say format = {FORMAT!r}")
     if card.get("version") != VERSION:
         raise PolicyFileError(
-            f"{file.name} has version {card.get('version')!r}: this release reads {VERSION}; train the policy anew"
+            f"{file.name} has version {card.get('version')!r}: this release reads {VERSION}; train it anew"
         )
     return card
+
+
+def control_in(path: str | Path) -> str:
+    """The control mode of a policy, from its card.
+
+    Args:
+        path: ``NAME.safetensors``.
+
+    Returns:
+        The ``control`` its environment needs.
+
+    Raises:
+        PolicyFileError: If there is no card, or it is none of ours.
+    """
+    return _config(read_card(path), Path(path)).control
 
 
 def _weights_path(path: str | Path) -> Path:
@@ -490,7 +509,9 @@ def _weights_path(path: str | Path) -> Path:
 def _bytes(path: Path) -> bytes:
     try:
         if path.stat().st_size > _LONGEST_FILE:
-            raise PolicyFileError(f"{path.name} has {path.stat().st_size} bytes: no policy of ours is so large")
+            raise PolicyFileError(
+                f"{path.name} has {path.stat().st_size} bytes: no policy of ours is so large"
+            )
         return path.read_bytes()
     except OSError as error:
         raise PolicyFileError(
@@ -530,7 +551,9 @@ def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor],
     """
     if set(tensors) != set(expected):
         missing, foreign = sorted(set(expected) - set(tensors)), sorted(set(tensors) - set(expected))
-        raise PolicyFileError(f"{path.name} holds other tensors: {missing} are missing, {foreign} are foreign")
+        raise PolicyFileError(
+            f"{path.name} holds other tensors: {missing} are missing, {foreign} are foreign"
+        )
     for name, tensor in tensors.items():
         wanted = expected[name]
         if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
@@ -545,22 +568,3 @@ def _check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise PolicyFileError(f"{path.name}: {name} has values that are not finite")
-
-
-def maker(path: Path) -> Callable[..., LearnedPolicy]:
-    """How ``load_policy`` makes the policy of a file.
-
-    Args:
-        path: ``NAME.safetensors``.
-
-    Returns:
-        Takes ``cell``, which must be the one it was trained for.
-    """
-
-    def make(cell: CellCfg | None = None) -> LearnedPolicy:
-        policy = load(path)
-        if cell is not None:
-            policy.check_cell(cell)
-        return policy
-
-    return make

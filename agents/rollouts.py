@@ -102,7 +102,8 @@ def _roll_at_once(
 ) -> list[Episode]:
     venv = _vec(policy.control, workpiece, n, perception)
     venv.seed(seed)
-    observation, label = venv.reset(), Labeller(venv.core)
+    observation: Any = venv.reset()
+    label = Labeller(venv.core)
     rng = np.random.default_rng([seed, n])
     frames: list[list[FloatRows]] = [[], [], []]
     lengths, live = np.zeros(n, np.int64), np.ones(n, np.bool_)
@@ -163,7 +164,8 @@ def _episode_metrics(
 ) -> list[dict[str, Any]]:
     venv = _vec(policy.control, workpiece, n, perception, **kwargs)
     venv.seed(seed)
-    observation, ended = venv.reset(), dict[int, dict[str, Any]]()
+    observation: Any = venv.reset()
+    ended: dict[int, dict[str, Any]] = {}
     while len(ended) < n:
         observation, _, done, infos = venv.step(policy.predict(observation)[0])
         for i in map(int, np.flatnonzero(done)):
