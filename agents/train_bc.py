@@ -4,11 +4,11 @@
 
 Loss. L2 as Zhou et al., 4.2, on the environment's scaled action: the six accelerations (for ``neural_rmp``
 of the expert's leaf, with the 21 Cholesky entries of its metric; for ``neural_rmp_identity`` of the leaf
-alone; for ``neural_control`` of the tip), each divided by the limit that an action of 1 means. It is the plainest loss that is the same for every kind. A
-loss on the resolved acceleration would not do for ``neural_rmp``: it leaves f and A free to trade against
-each other, and a metric that is right by accident beside the fixed leaves is wrong beside a leaf that the
-user adds. A label at its limit of +-1 has been clipped: a prediction beyond it is clipped as well and costs
-nothing.
+alone; for ``neural_control`` of the tip), each divided by the limit that an action of 1 means. It is the
+plainest loss that is the same for every kind. A loss on the resolved acceleration would not do for
+``neural_rmp``: it leaves f and A free to trade against each other, and a metric that is right by accident
+beside the fixed leaves is wrong beside a leaf that the user adds. A label at its limit of +-1 has been
+clipped: a prediction beyond it is clipped as well and costs nothing.
 
 Optimiser. `imitation`'s ``BC`` with Adam, whose negative log-likelihood is exchanged for the loss above; the
 learning rate falls along a half cosine over ``--epochs``. All kinds share data, split, batches, optimiser,
@@ -99,10 +99,10 @@ class TrainCfg:
 
     kind: str
     seed: int = 0
-    epochs: int = 60
+    epochs: int = 20
     batch: int = 1024
     learning_rate: float = 2e-3
-    patience: int = 15
+    patience: int = 5
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
