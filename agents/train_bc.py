@@ -68,6 +68,7 @@ from agents.policies import (
     PolicyFileError,
     SealNet,
     check_tensors,
+    load,
     save,
     write_whole,
 )
@@ -569,6 +570,34 @@ def best_of(cards: Sequence[dict[str, Any]]) -> int:
         return -reached, np.inf if None in errors else float(np.mean(errors))
 
     return min(range(len(cards)), key=lambda k: rank(cards[k]))
+
+
+def ship(trained: Sequence[Path], folder: Path) -> Path:
+    """Copies the training seeds of one kind, and the chosen one under the kind's name.
+
+    Args:
+        trained: Files of ``main``, one a training seed.
+        folder: ``agents.WEIGHTS``.
+
+    Returns:
+        The chosen one, where ``agents.load_policy`` finds it.
+
+    Raises:
+        ConfigError: If kinds, data or options differ, or a card has no validation scores.
+        PolicyFileError: If a file is missing or damaged.
+    """
+    found = [load(path) for path in trained]
+    cards = [policy.card for policy in found]
+    alike = ("config", "data_sha256", "dagger", "validation_perception")
+    for card in cards[1:]:
+        other = [k for k in alike if card.get(k) != cards[0].get(k)]
+        require(not other, f"seeds {cards[0]['seed']} and {card['seed']} differ in {other}: train them alike")
+    best = found[best_of(cards)]
+    for policy in found:
+        save(policy, folder / f"{policy.cfg.kind}-seed{policy.card['seed']}.safetensors", policy.card)
+    path = folder / f"{best.cfg.kind}.safetensors"
+    save(best, path, best.card)
+    return path
 
 
 # -- command line ---------------------------------------------------------------------------------------

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+import agents
 from agents import policies, rollouts, train_bc
 from agents.expert import RmpExpert
-from agents.policies import KINDS, PolicyFileError
+from agents.policies import KINDS, LearnedPolicy, PolicyFileError
 from agents.rollouts import Episode, Labeller
 from agents.train_bc import DaggerCfg, TrainCfg, Trainer, best_of, loss, split, train
 from seal_gym.core.errors import ConfigError
@@ -327,3 +328,24 @@ def test_the_seed_to_ship():
     assert best_of([card((0, None), (0, None)), card((0, None), (1, 2.0))]) == 1
     with pytest.raises(ConfigError, match="--validate"):
         best_of([{}])
+
+
+def test_shipping_takes_the_best_seed_and_keeps_the_others(tmp_path, monkeypatch):
+    def trained(seed, reached, **more):
+        path = tmp_path / f"run{seed}" / "x.safetensors"
+        made = {**card((10, 0.1), (reached, 0.1)), "seed": seed, "data_sha256": "d", **more}
+        policies.save(LearnedPolicy.fresh("neural_rmp", seed), path, made)
+        return path
+
+    paths, folder = [trained(seed, reached) for seed, reached in ((0, 9), (1, 10), (2, 8))], tmp_path / "w"
+    train_bc.ship(paths, folder)
+    assert {p.stem for p in folder.glob("*.safetensors")} == {
+        "neural_rmp",
+        *(f"neural_rmp-seed{k}" for k in range(3)),
+    }
+    monkeypatch.setattr(agents, "WEIGHTS", folder)
+    shipped = agents.load_policy("neural_rmp")
+    assert_same(shipped, LearnedPolicy.fresh("neural_rmp", 1))
+    assert shipped.card["seed"] == 1
+    with pytest.raises(ConfigError, match=r"seeds 0 and 3 differ in \['data_sha256'\]"):
+        train_bc.ship([paths[0], trained(3, 10, data_sha256="e")], folder)
