@@ -12,9 +12,7 @@ from agents import backend
 _GL = backend.choose()
 
 import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import json  # noqa: E402
 import sys  # noqa: E402
-import zipfile  # noqa: E402
 from collections.abc import Callable  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
@@ -25,106 +23,32 @@ import numpy as np  # noqa: E402
 import agents  # noqa: E402
 import seal_gym  # noqa: E402
 from agents import Policy  # noqa: E402
-from seal_gym.core.errors import ConfigError, SealGymError, require  # noqa: E402
-from seal_gym.envs.adapters import CONTROLS  # noqa: E402
+from seal_gym.core.errors import SealGymError  # noqa: E402
 from seal_gym.envs.config import PERCEPTIONS  # noqa: E402
 
 VIDEO_EVERY = 5  # frames: at 30 pictures a second, five times real time
-_CONTROL_BY_SIZE = {6: "tip", 27: "rmp"}
 
 
-def policy_at(path: Path, control: str | None = None) -> Policy:
-    """A policy from a file or a folder.
-
-    Args:
-        path: ``NAME.safetensors``, a run's folder, or SB3's ``NAME.zip``.
-        control: What the policy's action means; from the file by default.
-
-    Returns:
-        The policy.
-
-    Raises:
-        ConfigError: If it is none of these.
-    """
-    if path.is_dir():
-        path = path / "policy.safetensors"
-    if path.suffix == ".zip":
-        return _from_zip(path, control)
-    require(
-        path.suffix == ".safetensors",
-        f"policy = {str(path)!r}: must be one of {sorted(agents.POLICIES)}, a .safetensors file, a run's "
-        "folder or a .zip of Stable-Baselines3",
-    )
-    from agents import sb3_policies
-
-    reader = sb3_policies.cloned_policies() if _is_cloned(path) else sb3_policies
-    policy: Policy = reader.load(path)
-    require(
-        control in (None, policy.control), f"control = {control!r}: {path.name} acts with {policy.control!r}"
-    )
-    return policy
-
-
-def _is_cloned(path: Path) -> bool:
-    """Whether a card is one of a behaviour-cloned policy; a broken card is left for its reader to refuse."""
-    card = path.with_suffix(".json")
-    try:
-        known = json.loads(card.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(known, dict) and known.get("format") == "seal_gym policy"
-
-
-def _from_zip(path: Path, control: str | None) -> Policy:
-    from stable_baselines3 import PPO, SAC
-
-    from agents.sb3_policies import Sb3Policy
-
-    require(path.is_file(), f"policy = {str(path)!r}: no such file")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ConfigError(f"{path.name} is no zip of Stable-Baselines3, or a broken one ({error})") from error
-    kind = next((k for name, k in (("clip_range", PPO), ("target_entropy", SAC)) if name in data), None)
-    if kind is None:
-        raise ConfigError(
-            f"{path.name} was saved by neither PPO nor SAC: load it yourself with its own class"
-        )
-    # Schedules are pickled functions, which need not load on another Python, and which nobody needs here.
-    unused = {"learning_rate": 0.0, "lr_schedule": _zero, "clip_range": _zero, "clip_range_vf": None}
-    model = kind.load(path, device="cpu", custom_objects=unused)
-    assert model.action_space.shape is not None
-    known = control or _CONTROL_BY_SIZE.get(model.action_space.shape[0])
-    if known is None:
-        raise ConfigError(f"{path.name} gives {model.action_space.shape} actions: no control mode takes them")
-    return Sb3Policy(model.policy, known)
-
-
-def _zero(_: float) -> float:
-    return 0.0
-
-
-def find_policy(name: str, control: str | None = None) -> Policy:
+def find_policy(name: str) -> Policy:
     """A policy by name or path.
 
     Args:
-        name: One of ``agents.POLICIES``, or a path for ``policy_at``.
-        control: What a file's actions mean.
+        name: As ``agents.load_policy`` takes it; also weights of ``agents.train_sb3``, or a run's folder.
 
     Returns:
         The policy.
 
     Raises:
-        ConfigError: If there is none.
+        SealGymError: If there is none.
     """
-    if name in agents.POLICIES:
-        require(
-            control in (None, agents.control_of(name)),
-            f"control = {control!r}: policy {name!r} acts with {agents.control_of(name)!r}",
-        )
-        return agents.load_policy(name)
-    return policy_at(Path(name), control)
+    path = Path(name) / "policy.safetensors" if Path(name).is_dir() else Path(name)
+    if path.suffix == ".safetensors":
+        from agents import sb3_policies
+
+        if sb3_policies.is_ours(path):
+            return sb3_policies.load(path)
+        return agents.load_policy(str(path))
+    return agents.load_policy(name)
 
 
 def play(
@@ -251,9 +175,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="(default: %(default)s)",
     )
     parser.add_argument(
-        "--control", choices=CONTROLS, help="what a .zip's actions mean (default: by their number)"
-    )
-    parser.add_argument(
         "--perception", default=PERCEPTIONS[0], choices=PERCEPTIONS, help="(default: %(default)s)"
     )
     parser.add_argument("--episodes", type=int, default=1, help="(default: %(default)s)")
@@ -298,7 +219,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = parse(arguments)
     try:
-        policy = find_policy(options.policy, options.control)
+        policy = find_policy(options.policy)
         kwargs = {"control": policy.control, "perception": options.perception}
         env: Any = gym.make(
             options.env, render_mode="human" if options.human else None, disable_env_checker=True, **kwargs

@@ -8,7 +8,6 @@ import copy
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,6 +23,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor, nn
 
+from agents.policies import PolicyFileError, card_path, check_tensors, write_whole
 from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import ConfigError, require
 from seal_gym.envs.adapters import RmpAdapter, TipAdapter
@@ -403,28 +403,6 @@ class Sb3Policy:
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def cloned_policies() -> Any:
-    """The module of behaviour-cloned policies.
-
-    Returns:
-        ``agents.policies``: ``load(path)`` gives a policy whose ``net`` takes observations and gives actions,
-        ``save(policy, path, card)`` writes one.
-    """
-    return import_module("agents.policies")
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file so that a reader finds the old or the new one, never half of it.
-
-    Args:
-        path: The file.
-        data: What is in it.
-    """
-    partial = path.with_name(path.name + ".part")
-    partial.write_bytes(data)
-    partial.replace(path)
-
-
 def save(policy: BasePolicy, cfg: NetCfg, path: Path, card: Mapping[str, Any]) -> None:
     """Writes a policy's parameters and card.
 
@@ -435,9 +413,9 @@ def save(policy: BasePolicy, cfg: NetCfg, path: Path, card: Mapping[str, Any]) -
         card: What else to say about it, ready for JSON.
     """
     tensors = {name: values.detach().contiguous().clone() for name, values in policy.state_dict().items()}
-    write_atomically(path, save_tensors(tensors))
+    write_whole(path, save_tensors(tensors))
     text = json.dumps({"format": FORMAT, "net": asdict(cfg), **card}, indent=1)
-    write_atomically(path.with_suffix(".json"), (text + "\n").encode())
+    write_whole(card_path(path), (text + "\n").encode())
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -450,40 +428,51 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         Tensors by name.
 
     Raises:
-        ConfigError: If there is none, or it is broken or of another kind.
+        PolicyFileError: If there is none, or it is broken or of another kind.
     """
-    require(path.is_file(), f"weights {path.name!r} not found in {str(path.parent)!r}")
     try:
         tensors: dict[str, Tensor] = load_tensors(path.read_bytes())
+    except OSError as error:
+        raise PolicyFileError(f"{path} cannot be read ({error.strerror})") from error
     except (SafetensorError, KeyError, ValueError) as error:
-        raise ConfigError(
-            f"{path.name} is no safetensors file, or a broken one ({error}): make it anew with "
-            "python -m agents.train_sb3"
-        ) from error
+        raise PolicyFileError(f"{path.name} is no safetensors file, or a damaged one: {error}") from error
     return tensors
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """Reads a policy's card.
+def is_ours(path: Path) -> bool:
+    """Whether the card beside weights is one of this module's.
 
     Args:
-        path: The JSON file.
+        path: ``NAME.safetensors``.
 
     Returns:
-        What it says.
+        False as well if there is no card, or none that can be read.
+    """
+    try:
+        card = json.loads(card_path(path).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(card, dict) and card.get("format") == FORMAT
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """A policy's card.
+
+    Args:
+        path: ``NAME.safetensors``.
+
+    Returns:
+        What ``NAME.json`` says.
 
     Raises:
-        ConfigError: If there is none, or it is not one of ours.
+        PolicyFileError: If there is none, or it is not one of ours.
     """
-    require(
-        path.is_file(), f"card {path.name!r} not found in {str(path.parent)!r}: keep it beside the weights"
-    )
-    try:
-        card = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ConfigError(f"{path.name} is no JSON file ({error})") from error
-    known = isinstance(card, dict) and card.get("format") == FORMAT and isinstance(card.get("net"), dict)
-    require(known, f"{path.name} is no card of a policy from python -m agents.train_sb3")
+    file = card_path(path)
+    if not is_ours(path):
+        raise PolicyFileError(
+            f"{file.name} beside {path.name} is missing, or no card of a policy of python -m agents.train_sb3"
+        )
+    card = json.loads(file.read_bytes())
     assert isinstance(card, dict)
     return card
 
@@ -498,19 +487,16 @@ def load(path: Path) -> Sb3Policy:
         The policy.
 
     Raises:
-        ConfigError: If a file is missing, broken, or the two do not belong together.
+        PolicyFileError: If a file is missing, damaged, or the two do not belong together.
     """
-    card = read_card(path.with_suffix(".json"))
-    cfg = NetCfg.of(card["net"])
+    card = read_card(path)
+    try:
+        cfg = NetCfg.of(card.get("net", {}))
+    except ConfigError as error:
+        raise PolicyFileError(f"{card_path(path).name}: {error}") from error
     tensors = read_tensors(path)
     policy = build(cfg)
-    wanted = policy.state_dict()
-    fits = tensors.keys() == wanted.keys() and all(
-        v.shape == wanted[k].shape and v.dtype == wanted[k].dtype for k, v in tensors.items()
-    )
-    require(fits, f"{path.name} does not hold the network of its card {path.stem}.json")
-    finite = all(bool(torch.isfinite(v).all()) for v in tensors.values())
-    require(finite, f"{path.name} holds weights that are not finite")
+    check_tensors(tensors, policy.state_dict(), path)
     policy.load_state_dict(tensors)
     policy.set_training_mode(False)
     return Sb3Policy(policy, cfg.control, card)

@@ -44,7 +44,8 @@ from torch import Tensor  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 import seal_gym  # noqa: E402
-from agents import sb3_policies  # noqa: E402
+from agents import policies, sb3_policies  # noqa: E402
+from agents.policies import LearnedPolicy, PolicyFileError, write_whole  # noqa: E402
 from agents.sb3_policies import (  # noqa: E402
     ALGORITHMS,
     GaussianActorCritic,
@@ -52,9 +53,8 @@ from agents.sb3_policies import (  # noqa: E402
     Sb3Policy,
     put_actor,
     read_tensors,
-    write_atomically,
 )
-from seal_gym.core.errors import ConfigError, RenderError, SealGymError, require  # noqa: E402
+from seal_gym.core.errors import RenderError, SealGymError, require  # noqa: E402
 from seal_gym.envs.config import PERCEPTIONS  # noqa: E402
 from seal_gym.envs.sb3 import SealSb3VecEnv, make_sb3_vec  # noqa: E402
 from seal_gym.tasks.progress import SealTaskCfg  # noqa: E402
@@ -377,19 +377,19 @@ def make_model(cfg: TrainCfg, env: VecEnv) -> BaseAlgorithm:
     return model
 
 
-def cloned(cfg: TrainCfg) -> Any:
+def cloned(cfg: TrainCfg) -> LearnedPolicy:
     """The behaviour-cloned policy to start from.
 
     Args:
         cfg: Of a run with ``init``.
 
     Returns:
-        As ``agents.policies.load`` gives it: ``net`` is the module from observations to actions.
+        Its ``net`` is the module from observations to actions.
 
     Raises:
         ConfigError: If the control mode is another.
     """
-    policy = sb3_policies.cloned_policies().load(Path(cfg.init or ""))
+    policy = policies.load(Path(cfg.init or ""))
     require(
         policy.control == cfg.net.control,
         f"init = {cfg.init!r} acts with control={policy.control!r}: use --control {policy.control}",
@@ -441,7 +441,7 @@ def write_checkpoint(path: Path, model: BaseAlgorithm, about: dict[str, Any]) ->
         assert isinstance(model.replay_buffer, ReplayBuffer)
         counts |= {"pos": model.replay_buffer.pos, "full": int(model.replay_buffer.full)}
     text = json.dumps({**about, "counts": counts})
-    write_atomically(path, save_tensors(_tensors(model), {"run": text}))
+    write_whole(path, save_tensors(_tensors(model), {"run": text}))
 
 
 def read_about(path: Path) -> dict[str, Any]:
@@ -454,13 +454,13 @@ def read_about(path: Path) -> dict[str, Any]:
         As given to ``write_checkpoint``, with ``counts``.
 
     Raises:
-        ConfigError: If it is broken or no checkpoint of ours.
+        PolicyFileError: If it is broken or no checkpoint of ours.
     """
     try:
         with safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})["run"])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise ConfigError(
+        raise PolicyFileError(
             f"{path.name} is no checkpoint of python -m agents.train_sb3, or a broken one ({error}): "
             "remove the folder to start afresh"
         ) from error
@@ -476,7 +476,7 @@ def read_checkpoint(path: Path, model: BaseAlgorithm) -> None:
         model: From ``make_model`` with the same configuration, changed in place.
 
     Raises:
-        ConfigError: If it is broken or of another network.
+        PolicyFileError: If it is broken or of another network.
     """
     counts, tensors = read_about(path)["counts"], read_tensors(path)
     try:
@@ -496,7 +496,7 @@ def read_checkpoint(path: Path, model: BaseAlgorithm) -> None:
             model.replay_buffer.pos, model.replay_buffer.full = counts["pos"], bool(counts["full"])
         model.num_timesteps, model._n_updates = counts["steps"], counts["updates"]
     except (KeyError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"{path.name} does not fit this run's network ({error})") from error
+        raise PolicyFileError(f"{path.name} does not fit this run's network ({error})") from error
 
 
 def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -634,7 +634,7 @@ class Run:
 
     def _describe(self) -> None:
         text = json.dumps(about_run(self.cfg), indent=1)
-        write_atomically(self.out / "run.json", (text + "\n").encode())
+        write_whole(self.out / "run.json", (text + "\n").encode())
 
     def _policy(self, model: BaseAlgorithm) -> Sb3Policy:
         return Sb3Policy(model.policy, self.cfg.net.control)
@@ -654,11 +654,11 @@ class Run:
         assert isinstance(model.policy, GaussianActorCritic)
         policy = cloned(self.cfg)
         policy.net.load_state_dict(model.policy.actor.state_dict())
-        sb3_policies.cloned_policies().save(policy, path, card)
+        policies.save(policy, path, card)
 
     def _log(self, model: BaseAlgorithm, rows: list[dict[str, Any]]) -> None:
         text = "".join(json.dumps(row) + "\n" for row in rows)
-        write_atomically(self.out / "evaluations.jsonl", text.encode())
+        write_whole(self.out / "evaluations.jsonl", text.encode())
         for name, value in rows[-1].items():
             if value is not None and name != "step":
                 model.logger.record(f"eval/{name}", value)
@@ -690,7 +690,7 @@ def about_run(cfg: TrainCfg) -> dict[str, Any]:
     return {
         "command": shlex.join(["python", "-m", "agents.train_sb3", *sys.argv[1:]]),
         "control": cfg.net.control,
-        "config": cfg.comparable(),
+        "training": cfg.comparable(),
         "stack": {name: version(name) for name in _STACK},
     }
 

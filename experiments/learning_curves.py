@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import agents
 import seal_gym
+from agents.enjoy import find_policy
 from agents.train_sb3 import VALIDATION_SEED, play, summary
 from experiments import results
 from seal_gym.core.errors import ConfigError, SealGymError, require
@@ -76,7 +77,7 @@ def read_runs(folder: Path) -> list[dict[str, Any]]:
         try:
             about = json.loads(file.read_text(encoding="utf-8"))
             rows = [json.loads(line) for line in evaluations.read_text(encoding="utf-8").splitlines()]
-            cfg = about["config"]
+            cfg = about["training"]
             runs.append(
                 {
                     "env": cfg["env"],
@@ -145,9 +146,7 @@ def levels(env_id: str, episodes: int, perception: str, cloned: Iterable[Path] =
         if agents.control_of("rmp_expert") == control:
             policies["rmp_expert"] = agents.load_policy("rmp_expert")
         for path in cloned:
-            from agents.enjoy import policy_at
-
-            policy = policy_at(path)
+            policy = find_policy(str(path))
             if policy.control == control:
                 policies[f"bc_{path.stem}"] = policy
         for name, policy in policies.items():

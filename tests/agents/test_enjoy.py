@@ -1,17 +1,14 @@
-import zipfile
-
 import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3 import SAC
 
 import agents
 import seal_gym  # noqa: F401  # registers the ids
-from agents import sb3_policies
-from agents.enjoy import VIDEO_EVERY, film, find_policy, main, parse, policy_at
+from agents import policies, sb3_policies
+from agents.enjoy import VIDEO_EVERY, film, find_policy, main, parse
 from agents.sb3_policies import NetCfg
-from seal_gym.core.errors import ConfigError
 from seal_gym.envs.sb3 import make_sb3_vec
 from seal_gym.tasks.progress import SealTaskCfg
 
@@ -37,57 +34,29 @@ def test_it_prints_the_expert_s_metrics_as_a_loop_by_hand_gives_them(capsys):
     assert lines[2] == f"2 of 2 reached, mean RMSE {np.mean(errors):.4f} mm"
 
 
-@pytest.fixture(scope="module")
-def models(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("zips")
-    made = {}
-    for kind, control in ((PPO, "tip"), (SAC, "rmp"), (A2C, "tip")):
-        env = make_sb3_vec("SealGym/Flat-v0", 2, control=control, perception="oracle")
-        model = kind("MlpPolicy", env, device="cpu", seed=0)
-        model.save(folder / kind.__name__)
-        made[kind.__name__] = (model, folder / f"{kind.__name__}.zip")
-    return made
-
-
-@pytest.mark.parametrize(("kind", "control"), [("PPO", "tip"), ("SAC", "rmp")])
-def test_a_zip_of_sb3_acts_as_the_model_that_was_saved(models, kind, control):
-    model, path = models[kind]
-    policy = find_policy(str(path))
-    assert policy.control == control
+def test_a_zip_of_sb3_acts_as_the_model_that_was_saved(tmp_path):
+    env = make_sb3_vec("SealGym/Flat-v0", 2, control="rmp", perception="oracle")
+    model = SAC("MlpPolicy", env, device="cpu", seed=0)
+    model.save(tmp_path / "mine")
+    policy = find_policy(str(tmp_path / "mine.zip"))
+    assert policy.control == "rmp"
     rows = np.random.default_rng(0).normal(size=(3, 35)).astype(np.float32)
     np.testing.assert_array_equal(policy.predict(rows)[0], model.predict(rows, deterministic=True)[0])
 
 
-def test_six_actions_may_be_joints(models):
-    assert policy_at(models["PPO"][1], "joint").control == "joint"
-
-
-def test_other_zips_are_refused(models, tmp_path):
-    with pytest.raises(ConfigError, match="neither PPO nor SAC"):
-        policy_at(models["A2C"][1])
-    with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
-        archive.writestr("hello", "world")
-    (tmp_path / "y.zip").write_bytes(b"nothing")
-    for name in ("x.zip", "y.zip"):
-        with pytest.raises(ConfigError, match="no zip of Stable-Baselines3"):
-            policy_at(tmp_path / name)
-    with pytest.raises(ConfigError, match="no such file"):
-        policy_at(tmp_path / "z.zip")
-
-
-def test_a_run_s_folder_is_a_policy(tmp_path):
-    cfg = NetCfg(hidden=(8,))
-    sb3_policies.save(sb3_policies.build(cfg), cfg, tmp_path / "policy.safetensors", {})
-    assert policy_at(tmp_path).control == "tip"
-    with pytest.raises(ConfigError, match="control = 'rmp'"):
-        policy_at(tmp_path, "rmp")
+def test_a_run_s_folder_is_a_policy_of_either_kind(tmp_path):
+    path, cfg = tmp_path / "policy.safetensors", NetCfg(hidden=(8,))
+    sb3_policies.save(sb3_policies.build(cfg), cfg, path, {})
+    assert isinstance(find_policy(str(tmp_path)), sb3_policies.Sb3Policy)
+    policies.save(policies.LearnedPolicy.fresh("neural_rmp", 0), path, {})
+    assert isinstance(find_policy(str(path)), policies.LearnedPolicy)
 
 
 def test_wrong_names_are_named(capsys):
     assert main(["--policy", "rmp_export"]) == 2
     assert "rmp_expert" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="acts with 'rmp'"):
-        find_policy("rmp_expert", "tip")
+    assert main(["--policy", "missing.safetensors"]) == 2
+    assert "missing" in capsys.readouterr().err
     for wrong in (["--episodes", "0"], ["--video", "x.gif"], ["--video", "x.mp4", "--human"]):
         with pytest.raises(SystemExit):
             parse(wrong)

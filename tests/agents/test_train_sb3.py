@@ -1,7 +1,6 @@
 import copy
 import json
 import pickle
-import types
 from itertools import pairwise
 
 import gymnasium as gym
@@ -12,7 +11,8 @@ from torch import nn
 
 import agents
 import seal_gym  # noqa: F401  # registers the ids
-from agents import sb3_policies
+from agents import policies, sb3_policies
+from agents.policies import PolicyFileError
 from agents.sb3_policies import NetCfg, Scale, put_actor
 from agents.train_sb3 import (
     PpoCfg,
@@ -226,7 +226,7 @@ def test_a_broken_checkpoint_is_refused(tmp_path, damage):
     Run(cfg=cfg, out=tmp_path, tensorboard=False).train()
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:-50] if damage == "short" else b"PK\x03\x04")
-    with pytest.raises(ConfigError, match=r"checkpoint\.safetensors"):
+    with pytest.raises(PolicyFileError, match=r"checkpoint\.safetensors"):
         Run(cfg=cfg, out=tmp_path, tensorboard=False).train()
 
 
@@ -247,7 +247,7 @@ def test_the_command_line_trains_and_names_what_is_wrong(tmp_path, capsys):
     assert main([*short, "--control", "rmp", "--out", str(tmp_path / "run")]) == 0
     assert "8192 steps: reached 0 %" in capsys.readouterr().out
     policy = sb3_policies.load(tmp_path / "run" / "policy.safetensors")
-    assert policy.control == "rmp" and policy.card["config"]["env"] == "SealGym/Flat-v0"
+    assert policy.control == "rmp" and policy.card["training"]["env"] == "SealGym/Flat-v0"
     assert main(["--seed", "500000", "--out", str(tmp_path / "no")]) == 2
     assert "seed = 500000" in capsys.readouterr().err
     cfg = config(parse(["--algo", "sac", "--n-envs", "8", "--out", "x"]))
@@ -305,37 +305,41 @@ def test_a_module_that_does_not_fit_is_refused(module):
     assert policy.actor is actor
 
 
-def test_fine_tuning_starts_at_the_clone_and_first_teaches_the_critic(tmp_path, monkeypatch):
-    clone, saved, actors = StandIn(), [], []
-    stand_in = types.SimpleNamespace(
-        load=lambda path: types.SimpleNamespace(control="tip", net=copy.deepcopy(clone), path=path),
-        save=lambda policy, path, card: saved.append(
-            (policy.net.state_dict(), path.name, card["scores"]["step"])
-        ),
-    )
-    monkeypatch.setattr(sb3_policies, "cloned_policies", lambda: stand_in)
+@pytest.fixture
+def clone(tmp_path):
+    path = tmp_path / "clone.safetensors"
+    policies.save(policies.LearnedPolicy.fresh("neural_control", 0), path, {})
+    return path
+
+
+def test_fine_tuning_starts_at_the_clone_and_first_teaches_the_critic(clone, tmp_path, monkeypatch):
+    weights, seen = policies.load(clone).net.state_dict(), []
 
     def watching(policy, venv, seed):
-        actors.append(copy.deepcopy(policy._policy.actor.state_dict()))
+        seen.append(copy.deepcopy(policy._policy.actor.state_dict()))
         return play(policy, venv, seed)
 
     monkeypatch.setattr("agents.train_sb3.play", watching)
-    Run(cfg=tiny(init="clone.safetensors"), out=tmp_path, tensorboard=False).train()
+    cfg = tiny(init=str(clone))
+    rows = Run(cfg=cfg, out=tmp_path / "run", tensorboard=False).train()
     for evaluation in (0, 1):  # the first round holds the actor still
-        assert torch.equal(actors[evaluation]["out.weight"], clone.out.weight)
-    assert not torch.equal(actors[2]["out.weight"], clone.out.weight)
-    weights, name, step = saved[0]
-    assert (name, step) == ("policy.safetensors", 0) and torch.equal(weights["out.weight"], clone.out.weight)
+        for name, values in weights.items():
+            assert torch.equal(seen[evaluation][name], values)
+    assert all(not torch.equal(seen[2][name], values) for name, values in weights.items())
+    # what is written is a policy of the clone's kind, with the weights of the best evaluation
+    tuned = policies.load(tmp_path / "run" / "policy.safetensors")
+    best = [row["step"] for row in rows].index(tuned.card["scores"]["step"])
+    assert tuned.control == "tip" and tuned.card["training"]["init"] == str(clone)
+    for name, values in tuned.net.state_dict().items():
+        assert torch.equal(seen[best][name], values)
 
 
-def test_a_clone_that_cannot_be_the_start_is_refused(monkeypatch):
-    stand_in = types.SimpleNamespace(load=lambda _: types.SimpleNamespace(control="tip", net=StandIn()))
-    monkeypatch.setattr(sb3_policies, "cloned_policies", lambda: stand_in)
-    cfg = tiny(control="rmp", init="clone.safetensors")
+def test_a_clone_that_cannot_be_the_start_is_refused(clone):
+    cfg = tiny(control="rmp", init=str(clone))
     with pytest.raises(ConfigError, match="--control tip"):
         make_model(cfg, training_env(cfg))
     with pytest.raises(ConfigError, match="use --algo ppo"):
-        tiny("sac", init="clone.safetensors")
+        tiny("sac", init=str(clone))
 
 
 # -- files ----------------------------------------------------------------------------------------------
@@ -371,16 +375,16 @@ class Bomb:
     [
         (lambda p: p.write_bytes(p.read_bytes()[:-9]), "no safetensors file"),
         (lambda p: p.write_bytes(pickle.dumps(Bomb())), "no safetensors file"),
-        (lambda p: p.unlink(), "not found"),
-        (lambda p: p.with_suffix(".json").unlink(), "card 'p.json' not found"),
-        (lambda p: p.with_suffix(".json").write_text("{"), "no JSON"),
+        (lambda p: p.unlink(), "cannot be read"),
+        (lambda p: p.with_suffix(".json").unlink(), r"p\.json .* is missing"),
+        (lambda p: p.with_suffix(".json").write_text("{"), "no card"),
         (lambda p: p.with_suffix(".json").write_text('{"format": "x", "net": {}}'), "no card"),
     ],
 )
 def test_broken_and_foreign_files_are_refused_unread(stored, damage, message):
     _, path = stored
     damage(path)
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(PolicyFileError, match=message):
         sb3_policies.load(path)
 
 
@@ -389,18 +393,18 @@ def test_weights_of_another_network_or_not_finite_are_refused(stored):
     card = json.loads(path.with_suffix(".json").read_text())
     card["net"]["hidden"] = [9, 8]
     path.with_suffix(".json").write_text(json.dumps(card))
-    with pytest.raises(ConfigError, match="does not hold the network of its card"):
+    with pytest.raises(PolicyFileError, match="of shape"):
         sb3_policies.load(path)
     card["net"] = {"hidden": 3}
     path.with_suffix(".json").write_text(json.dumps(card))
-    with pytest.raises(ConfigError, match="no description of a network"):
+    with pytest.raises(PolicyFileError, match="no description of a network"):
         sb3_policies.load(path)
     cfg = NetCfg(algo="ppo", hidden=(8,))
     other = sb3_policies.build(cfg)
     with torch.no_grad():
         other.log_std[0] = float("nan")
     sb3_policies.save(other, cfg, path, {})
-    with pytest.raises(ConfigError, match="not finite"):
+    with pytest.raises(PolicyFileError, match="not finite"):
         sb3_policies.load(path)
 
 
@@ -408,5 +412,5 @@ def test_a_run_s_card_names_command_and_stack(monkeypatch):
     monkeypatch.setattr("sys.argv", ["train", "--seed", "3"])
     card = about_run(tiny())
     assert card["command"] == "python -m agents.train_sb3 --seed 3"
-    assert "ppo" in card["config"] and "sac" not in card["config"]
+    assert "ppo" in card["training"] and "sac" not in card["training"]
     assert card["stack"]["gymnasium"] == gym.__version__

@@ -37,7 +37,7 @@ def write_run(folder, name, seed, control="tip", rows=ROWS):
         "init": None,
         "net": net,
     }
-    (path / "run.json").write_text(json.dumps({"command": "train", "config": cfg, "stack": {}}))
+    (path / "run.json").write_text(json.dumps({"command": "train", "training": cfg, "stack": {}}))
     (path / "evaluations.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
     return path
 
