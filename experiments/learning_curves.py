@@ -36,7 +36,7 @@ _COLOURS = {"tip": "#d1382c", "rmp": "#1f5fa8"}
 _CONTROLS = {"tip": "direct control (tip acceleration)", "rmp": "RMP (f and metric)"}
 _LEVELS = {"random": ":", "zero": "-.", "rmp_expert": "--"}
 _LEVEL_COLOUR = "#6d7278"
-_NONE_MM = 10.0  # where the picture shows an RMSE that does not exist: no episode reached the end
+_MARKERS = {"tip": "o", "rmp": "s"}
 
 
 class Constant:
@@ -231,7 +231,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         cells += ["-" if row["training_seed"] is None else str(row["training_seed"])]
         cells += [f"{row['steps']:,}" if row["steps"] else "-", goal]
         cells += [f"{row[k]:.0f}" for k in ("reached_pct", "collision_pct", "timeout_pct")]
-        cells += ["-" if row["rmse_mm"] is None else f"{row['rmse_mm']:.3f}"]
+        cells += ["-" if row["rmse_mm"] is None else f"{row['rmse_mm']:.4f}"]
         cells += ["-" if row["time_s"] is None else f"{row['time_s']:.1f}", f"{row['return']:.0f}"]
         lines.append("| " + " | ".join(cells) + " |")
     episodes = rows[0]["episodes"]
@@ -244,10 +244,45 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _curve(run: dict[str, Any], name: str, steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    rows = run["evaluations"]
-    values = [_NONE_MM if row[name] is None else row[name] for row in rows]
-    return np.asarray(np.interp(steps, [row["step"] for row in rows], values))
+def curves(runs: list[dict[str, Any]], name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """An evaluation's figure over steps, of runs that differ in their seed.
+
+    Args:
+        runs: From ``read_runs``.
+        name: Of the figure.
+
+    Returns:
+        Steps that all of them were evaluated at, shape (k,), and the values, shape (len(runs), k); NaN where
+        there is none: no episode reached the end.
+    """
+    tables = [{row["step"]: row[name] for row in run["evaluations"]} for run in runs]
+    steps = sorted(set.intersection(*(set(table) for table in tables)))
+    values = [[np.nan if table[step] is None else table[step] for step in steps] for table in tables]
+    return np.array(steps, dtype=np.float64), np.array(values, dtype=np.float64)
+
+
+def _draw_group(axes: Any, runs: list[dict[str, Any]], name: str, label: str) -> None:
+    """Middle and range of the seeds; the mean of an RMSE is that of its logarithm, as the axis shows it."""
+    steps, values = curves(runs, name)
+    some = np.isfinite(values).any(axis=0)
+    steps, values = steps[some] / 1e6, values[:, some]
+    if not len(steps):
+        return
+    middle = np.exp(np.nanmean(np.log(values), axis=0)) if name == "rmse_mm" else np.nanmean(values, axis=0)
+    control, ppo = runs[0]["control"], runs[0]["algo"] == "ppo"
+    colour = _COLOURS[control]
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    axes.fill_between(steps, low, high, color=colour, alpha=0.18, lw=0)
+    axes.plot(
+        steps,
+        middle,
+        color=colour,
+        ls="-" if ppo else "--",
+        marker=_MARKERS[control],
+        ms=4,
+        lw=1.8,
+        label=label,
+    )
 
 
 def draw(path: Path, runs: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
@@ -272,31 +307,17 @@ def draw(path: Path, runs: list[dict[str, Any]], rows: list[dict[str, Any]]) -> 
             group = [
                 r for r in here if (r["algo"], r["control"], r["init"] is None) == (algo, control, scratch)
             ]
-            last = min(run["evaluations"][-1]["step"] for run in group)
-            steps = np.linspace(0.0, last, 200)
-            label = f"{algo.upper()}{'' if scratch else ' from BC'}, {_CONTROLS[control]}, {len(group)} seeds"
-            style = {"color": _COLOURS[control], "ls": "-" if algo == "ppo" else (0, (4, 1.5))}
-            for axes, name in ((reached, "reached_pct"), (rmse, "rmse_mm")):
-                curves = np.stack([_curve(run, name, steps) for run in group])
-                middle = np.exp(np.log(curves).mean(axis=0)) if name == "rmse_mm" else curves.mean(axis=0)
-                axes.fill_between(
-                    steps / 1e6,
-                    curves.min(axis=0),
-                    curves.max(axis=0),
-                    color=style["color"],
-                    alpha=0.18,
-                    lw=0,
-                )
-                axes.plot(steps / 1e6, middle, lw=2.0, label=label, **style)
+            seeds = f"{len(group)} seed{'s' if len(group) > 1 else ''}"
+            label = f"{algo.upper()}{'' if scratch else ' from BC'}, {_CONTROLS[control]}, {seeds}"
+            _draw_group(reached, group, "reached_pct", label)
+            _draw_group(rmse, group, "rmse_mm", label)
         _draw_levels(reached, rmse, [row for row in level_rows if row["env"] == env])
         reached.axhline(GOAL_REACHED_PCT, color="#2a9d54", lw=1.0)
         rmse.axhline(GOAL_RMSE_MM, color="#2a9d54", lw=1.0)
         reached.set(title=env, ylabel="episodes that reached the end [%]", ylim=(-3, 103))
-        rmse.set(xlabel="steps of experience [millions]", ylabel="RMSE of those [mm]", yscale="log")
-        rmse.set_ylim(None, 1.25 * _NONE_MM)
-        rmse.text(
-            0.99, 0.965, "top: none reached", transform=rmse.transAxes, ha="right", va="top", fontsize=8
-        )
+        rmse.set(xlabel="steps of experience [millions]", ylabel="RMSE of those that reached [mm]")
+        rmse.set_yscale("log")
+        rmse.set_ylim(None, 10.0)
         for axes in (reached, rmse):
             axes.grid(color="#dddddd", lw=0.6)
         if column == 0:
@@ -306,9 +327,9 @@ def draw(path: Path, runs: list[dict[str, Any]], rows: list[dict[str, Any]]) -> 
                 axes.text(
                     0.99, goal, "goal", transform=place, color="#2a9d54", ha="right", va="bottom", fontsize=8
                 )
+    eyes = " and ".join(dict.fromkeys(run["perception"] for run in runs))
     figure.suptitle(
-        "Learning to seal from scratch: mean and range of the training seeds, on validation seeds",
-        fontsize=12,
+        f"Learning to seal, {eyes} features: mean and range of the training seeds, validation episodes"
     )
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -326,7 +347,7 @@ def _draw_levels(reached: Any, rmse: Any, rows: list[dict[str, Any]]) -> None:
             rmse.text(
                 0.01,
                 row["rmse_mm"],
-                f"{name} {row['rmse_mm']:.3f} mm",
+                f"{name} {row['rmse_mm']:.4f} mm",
                 transform=rmse.get_yaxis_transform(),
                 color=_LEVEL_COLOUR,
                 fontsize=8,

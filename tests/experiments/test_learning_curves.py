@@ -88,11 +88,10 @@ def test_tables_and_picture_are_written_and_drawn_again(short, tmp_path, capsys)
     assert (out / "learning_curves.png").read_bytes() == first
 
 
-def test_a_curve_goes_through_its_evaluations():
-    run = {"evaluations": ROWS}
-    steps = np.array([0.0, 50.0, 100.0, 400.0])
-    np.testing.assert_allclose(lc._curve(run, "reached_pct", steps), [0.0, 40.0, 80.0, 100.0])
-    np.testing.assert_allclose(lc._curve(run, "rmse_mm", steps), [10.0, 5.1, 0.2, 0.1])
+def test_curves_hold_the_evaluations_that_all_seeds_have():
+    steps, values = lc.curves([{"evaluations": ROWS}, {"evaluations": ROWS[:3]}], "rmse_mm")
+    np.testing.assert_array_equal(steps, [0, 100, 200])
+    np.testing.assert_array_equal(values, [[np.nan, 0.2, 1.2]] * 2)
 
 
 def test_missing_and_broken_runs_are_named(tmp_path, capsys):
