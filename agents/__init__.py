@@ -1,7 +1,9 @@
-"""Policies: the RMP expert, and what will learn from it."""
+"""Policies: the RMP expert, and what has learned from it."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,14 @@ from numpy.typing import NDArray
 from agents.expert import RmpExpert
 from seal_gym.core.errors import ConfigError
 
-__all__ = ["POLICIES", "Policy", "control_of", "load_policy"]
+if TYPE_CHECKING:
+    from seal_gym.core.cell import CellCfg
+
+__all__ = ["POLICIES", "WEIGHTS", "NamedPolicy", "Policy", "control_of", "load_policy"]
+
+WEIGHTS = Path(__file__).parent / "weights"
+"""The weights of the learned policies, ``NAME.safetensors`` with their cards ``NAME.json``."""
+_FILES = (".safetensors", ".zip")
 
 
 class Policy(Protocol):
@@ -31,51 +40,111 @@ class Policy(Protocol):
         """Gives the actions for observations, of one environment or of N."""
 
 
-POLICIES: dict[str, Callable[..., Policy]] = {"rmp_expert": RmpExpert}
+@dataclass(frozen=True)
+class NamedPolicy:
+    """A policy that can be asked for.
+
+    Attributes:
+        control: The ``control`` its environment needs.
+        make: Builds it for a cell (None: the one it was made for).
+    """
+
+    control: str
+    make: Callable[["CellCfg | None"], Policy]
 
 
-def _named(name: str) -> Callable[..., Policy]:
-    if name not in POLICIES:
-        raise ConfigError(f"policy = {name!r}: must be one of {sorted(POLICIES)}")
-    return POLICIES[name]
+def _learned(name: str) -> Callable[["CellCfg | None"], Policy]:
+    def make(cell: "CellCfg | None") -> Policy:
+        path = WEIGHTS / f"{name}.safetensors"
+        if not path.is_file():
+            raise ConfigError(
+                f"policy {name!r} has no weights in {WEIGHTS.parent.name}/{WEIGHTS.name} yet: collect "
+                "demonstrations with `python -m agents.collect --out DATA`, train with `python -m "
+                f"agents.train_bc --policy {name} --seed 0 --data DATA --out RUN`, and load_policy"
+                f"('RUN/{name}-seed0.safetensors'), or copy that file and its .json there as {path.name}"
+            )
+        return _from_weights(path, cell)
+
+    return make
+
+
+def _from_weights(path: Path, cell: "CellCfg | None") -> Policy:
+    from agents import policies  # needs torch: only when asked for
+
+    policy = policies.load(path)
+    if cell is not None:
+        policy.check_cell(cell)
+    return policy
+
+
+POLICIES: dict[str, NamedPolicy] = {
+    "rmp_expert": NamedPolicy("rmp", RmpExpert),
+    "neural_rmp": NamedPolicy("rmp", _learned("neural_rmp")),
+    "neural_rmp_identity": NamedPolicy("rmp", _learned("neural_rmp_identity")),
+    "neural_control": NamedPolicy("tip", _learned("neural_control")),
+}
+
+
+def _find(name: str) -> NamedPolicy:
+    """The policy of a name or of a file."""
+    if name in POLICIES:
+        return POLICIES[name]
+    path = Path(name)
+    if path.suffix == ".safetensors":
+        from agents import policies
+
+        control = policies.control_in(path)
+        return NamedPolicy(control, lambda cell: _from_weights(path, cell))
+    if path.suffix == ".zip":
+        from agents import sb3_models
+
+        return NamedPolicy(sb3_models.control_in(path), lambda _: sb3_models.load(path))
+    raise ConfigError(
+        f"policy = {name!r}: must be one of {sorted(POLICIES)}, or the path of a file {' or '.join(_FILES)}"
+    )
 
 
 def control_of(name: str) -> str:
     """The control mode that a policy needs.
 
     Args:
-        name: Of the policy.
+        name: Of the policy, as ``load_policy`` takes it.
 
     Returns:
         The environment's ``control``.
 
     Raises:
         ConfigError: If there is no such policy.
+        PolicyFileError: If a file is missing, damaged or no policy.
     """
-    return str(_named(name).control)  # type: ignore[attr-defined]  # every registered policy class has it
+    return _find(name).control
 
 
 def load_policy(name: str, env: Any = None) -> Policy:
-    """A policy by name.
+    """A policy by name, or from a file.
 
     Args:
-        name: One of ``POLICIES``.
-        env: The environment it will act in: checked against the policy's control mode, and the source of
-            the cell's calibration.
+        name: One of ``POLICIES``; or the path of weights that ``agents.train_bc`` wrote
+            (``NAME.safetensors``, nothing in it is executed); or of a model that Stable-Baselines3 saved
+            (``NAME.zip``: it can run code as it is loaded, so load only what you trust).
+        env: The environment it will act in, single or vectorised: checked against the policy's control mode,
+            and the source of the cell's calibration.
 
     Returns:
         The policy.
 
     Raises:
-        ConfigError: If there is no such policy, or the environment's control mode is another.
+        ConfigError: If there is no such policy, it has no weights yet, or the environment's control mode or
+            cell is another.
+        PolicyFileError: If a file is missing, damaged or no policy.
     """
-    make = _named(name)
+    found = _find(name)
     if env is None:
-        return make()
+        return found.make(None)
     cfg = getattr(env, "unwrapped", env).core.cfg
-    if cfg.control != control_of(name):
+    if cfg.control != found.control:
         raise ConfigError(
-            f"policy {name!r} acts with control={control_of(name)!r}, the environment has {cfg.control!r}: "
-            f"make it with control={control_of(name)!r}"
+            f"policy {name!r} acts with control={found.control!r}, the environment has {cfg.control!r}: "
+            f"make it with control={found.control!r}"
         )
-    return make(cell=cfg.cell)
+    return found.make(cfg.cell)
