@@ -82,6 +82,7 @@ def test_the_metric_is_positive_definite_for_any_weights_and_input(seed, seen):
     for action in actions:
         assert np.isfinite(action).all()
         assert np.abs(action).max() <= 1.0
+        assert action[[6, 8, 11, 15, 20, 26]].min() > 0  # the factor's diagonal: one factor for one metric
         exact = exact_metric(action[6:])
         assert min(leading_minors(exact)) > 0
         # ... and it is the matrix that the environment makes of the action.
