@@ -9,14 +9,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from agents.expert import RmpExpert
-from seal_gym.core.cell import CellCfg, load_cell
+from seal_gym.core.cell import CellCfg
 from seal_gym.core.errors import is_number, require
 from seal_gym.core.frames import Array
-from seal_gym.core.kinematics import tip_kinematics
 from seal_gym.envs.adapters import ArmState, make_adapter
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore, StepResult
-from seal_gym.rmp import SealingCfg, SeamErrors
+from seal_gym.rmp import SealingCfg
 from seal_gym.workpieces.catalogue import NAMES
 
 MAX_SEED = 500_000
@@ -201,6 +200,44 @@ def episode_offsets(seed: int, frames: int, cell: CellCfg, cfg: CollectCfg) -> A
     return offsets(rng, frames, cell.timing.frame_s, cfg)
 
 
+def tip_scale(cell: CellCfg) -> Array:
+    """Tip accelerations that actions of 1 mean.
+
+    Args:
+        cell: Names the limits.
+
+    Returns:
+        Shape (6,), m/s^2 and rad/s^2.
+    """
+    return np.repeat((cell.limits.linear_m_s2, cell.limits.angular_rad_s2), 3)
+
+
+def tip_acceleration(qdd: Array, state: ArmState) -> Array:
+    """The tip's acceleration under joint accelerations.
+
+    Args:
+        qdd: Shape (N, 6), rad/s^2.
+        state: Of the arm.
+
+    Returns:
+        Shape (N, 6), m/s^2 and rad/s^2, in the tip frame.
+    """
+    return np.asarray((state.tip.jacobian @ qdd[:, :, None])[..., 0] + state.tip.drift)
+
+
+def tip_action(accel: Array, scale: Array) -> NDArray[np.float32]:
+    """Tip accelerations as ``control="tip"`` takes them.
+
+    Args:
+        accel: Shape (N, 6), m/s^2 and rad/s^2.
+        scale: What an action of 1 means, shape (6,).
+
+    Returns:
+        Shape (N, 6), in [-1, 1].
+    """
+    return np.minimum(np.maximum(accel / scale, -1.0), 1.0).astype(np.float32)
+
+
 class DisturbedAdapter:
     """The ``rmp`` adapter on a gun that drifts.
 
@@ -224,8 +261,7 @@ class DisturbedAdapter:
         """
         self._rmp, self._tip = make_adapter("rmp", cell, ()), make_adapter("tip", cell, ())
         self._damping_s = DEFAULT_SEALING.damping.damping_s
-        limits = cell.limits
-        self._scale = np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
+        self._scale = tip_scale(cell)
         self._frame_s = cell.timing.frame_s
         self._before = self._now = np.zeros(TWIST)
         self.label = np.zeros((0, TWIST), np.float32)
@@ -244,49 +280,11 @@ class DisturbedAdapter:
 
     def __call__(self, action: Array, state: ArmState) -> Array:
         """See ``seal_gym.envs.adapters.Adapter``."""
-        qdd = self._rmp(action, state)
-        accel = (state.tip.jacobian @ qdd[:, :, None])[..., 0] + state.tip.drift
-        self.label = _clipped(accel / self._scale).astype(np.float32)
+        accel = tip_acceleration(self._rmp(action, state), state)
+        self.label = tip_action(accel, self._scale)
         # The label sees the drift of the frame before, and damps that.
         push = self._damping_s * self._before + (self._now - self._before) / self._frame_s
         return self._tip((accel + push) / self._scale, state)
-
-
-def labels(observations: NDArray[np.float32], cell: CellCfg | None = None) -> dict[str, NDArray[np.float32]]:
-    """What the expert does, in both action spaces, by observations alone: for states that were not simulated.
-
-    ``rmp`` is exactly the expert's action. ``tip`` takes the measured motion for the commanded one, which no
-    observation holds: for collected states it differs from the label there by the servo's lag.
-
-    Args:
-        observations: Shape (n, 35).
-        cell: The cell; by default the nominal one.
-
-    Returns:
-        ``rmp`` (n, 27) and ``tip`` (n, 6), in [-1, 1].
-    """
-    cell = cell or load_cell()
-    o = np.asarray(observations, dtype=np.float64)
-    q, qd = o[:, 23:29], o[:, 29:35]
-    seam = np.zeros((len(o), TWIST))
-    seam[:, [X, Z]], seam[:, [ABOUT_X, ABOUT_Z]] = o[:, 6:8] / _MM, o[:, 8:10] / _DEG
-    state = ArmState(
-        q=q,
-        qd=qd,
-        tip=tip_kinematics(q, qd),
-        errors=SeamErrors(o[:, 0] / _MM, o[:, 1] / _DEG, o[:, 3] / _MM, o[:, 4] / _DEG, o[:, 10] / _DEG),
-        seam_twist=seam,
-        tip_accel=o[:, 17:23],
-        part_pose=np.zeros((len(o), 4, 4)),
-    )
-    adapter = DisturbedAdapter(cell)
-    rmp, _ = RmpExpert(cell).predict(np.asarray(observations, np.float32))
-    adapter(rmp.astype(np.float64), state)
-    return {"rmp": rmp, "tip": adapter.label}
-
-
-def _clipped(action: Array) -> Array:
-    return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0))
 
 
 @lru_cache(maxsize=4)

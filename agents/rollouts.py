@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.episodes import tip_acceleration, tip_action, tip_scale
 from agents.expert import RmpExpert
 from seal_gym.core.errors import require
 from seal_gym.envs.adapters import RmpAdapter
@@ -41,7 +42,7 @@ class Labeller:
         """
         cell = core.cfg.cell
         self._core, self._expert, self._adapter = core, RmpExpert(cell), RmpAdapter(cell)
-        self._scale = np.repeat((cell.limits.linear_m_s2, cell.limits.angular_rad_s2), 3)
+        self._scale = tip_scale(cell)
 
     def __call__(self, observation: FloatRows) -> tuple[FloatRows, FloatRows]:
         """Labels one frame.
@@ -54,11 +55,9 @@ class Labeller:
             leaf and the fixed leaves, shape (N, 6); the rmp action, shape (N, 27).
         """
         rmp, _ = self._expert.predict(observation)
-        state = self._core._arm_state()
+        state = self._core.arm_state()
         qdd = self._adapter(rmp.astype(np.float64), state)
-        accel = (state.tip.jacobian @ qdd[:, :, None])[..., 0] + state.tip.drift
-        tip = np.minimum(np.maximum(accel / self._scale, -1.0), 1.0).astype(np.float32)
-        return tip, rmp
+        return tip_action(tip_acceleration(qdd, state), self._scale), rmp
 
 
 def _vec(policy_control: str, workpiece: str, n: int, perception: str, **kwargs: Any) -> SealSb3VecEnv:

@@ -239,7 +239,7 @@ class SealCore:
             ActionError: If the action has a wrong shape or is not finite.
         """
         action = self._checked(action)
-        qdd = self.adapter(action, self._arm_state())
+        qdd = self.adapter(action, self.arm_state())
         touched = self.arm.step(qdd)
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
@@ -275,8 +275,8 @@ class SealCore:
             )
         return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0), dtype=np.float64)
 
-    def _arm_state(self) -> ArmState:
-        """The commanded motion: integrating along it keeps the servo's lag out of the policy's loop."""
+    def arm_state(self) -> ArmState:
+        """What an adapter reads now: the commanded motion, so that the servo's lag stays out of its loop."""
         self._command = tip_kinematics(self.arm.q_command, self.arm.qd_command)
         return ArmState(
             q=self.arm.q_command,

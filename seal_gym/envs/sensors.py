@@ -38,6 +38,10 @@ class Sensors:
         """
         self._scene, self._cfg = scene, cfg
         self.look = Look.empty(n)
+        # The lamp on the gun shines from above the plate: on the other side if the wall is on the right.
+        start = scene.workpiece.seam.at(0.0)
+        right = np.cross(start.tangent, [0.0, 0.0, 1.0])
+        self._mirrored = bool(start.approach @ right < -1e-6)
         self.snr_db: Array | None = None
 
     def reset(self, i: int, rng: np.random.Generator) -> None:
@@ -48,6 +52,8 @@ class Sensors:
             rng: Source of the draws.
         """
         self.look.draw(i, rng, self._cfg.look)
+        if self._mirrored:
+            self.look.lamp[i, 0] *= -1.0
 
     def images(self, tip_pose: Array, arm: ArmBatch, frame: NDArray[np.int64]) -> Images:
         """Both ROIs of all simulations.

@@ -316,7 +316,10 @@ class Perception:
         ref = views.reference
         self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
         self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.numbers
-        self._par = TrackNumbers.of(cfg, frame_s, _FILLET_PLATE if plate is None else plate)
+        plate = _FILLET_PLATE if plate is None else plate
+        self._par = TrackNumbers.of(cfg, frame_s, plate)
+        # With the wall on the right the seam's dark and bright sides change places in both views.
+        self._negative = bool(plate[0] > 1e-6)
         rays = (int(self._par.memory) + 1) * (int(cfg.ahead_px) + 1)
         self._state = TrackState(
             point=np.zeros((n, 3)),
@@ -367,6 +370,8 @@ class Perception:
             The seam's lines; arrays of the caller's own. A view that has not shown the seam for the
             coasting time is invalid.
         """
+        if self._negative:
+            front, side = 255 - front, 255 - side
         images = np.ascontiguousarray(front), np.ascontiguousarray(side)
         tips = np.ascontiguousarray(tip_pose, dtype=np.float64)
         fresh = np.ones(self._n, np.bool_) if rows is None else np.ascontiguousarray(rows, np.bool_)

@@ -172,15 +172,6 @@ def test_the_tip_label_moves_the_gun_as_the_experts_rmp_does():
         env.close()
 
 
-def test_labels_by_observations_alone_agree_with_the_collected_ones(reference):
-    data = demos.load(reference)
-    alone = episodes.labels(data.observations)
-    np.testing.assert_array_equal(alone["rmp"], data.actions("rmp"))
-    spread = data.actions("tip").std(axis=0)
-    wrong = np.sqrt(np.mean((alone["tip"] - data.actions("tip")) ** 2, axis=0))
-    assert (wrong[[X, Z, ABOUT_X, ABOUT_Z]] < 0.05 * spread[[X, Z, ABOUT_X, ABOUT_Z]]).all()
-
-
 def test_undisturbed_episodes_are_those_of_the_expert_in_the_environment():
     (e,) = episodes.run(Work(indices=(1,), seed=70, cfg=STILL))
     assert not e.offset.any()
