@@ -66,7 +66,7 @@ class PerceptionCfg:
     row_sigma_m: float = 3.0 * _MM
     side_px: float = 18.0
     height_q_m: float = 0.01 * _MM
-    pitch_q_rad: float = 0.1 * _DEG
+    pitch_q_rad: float = 0.3 * _DEG
     gate: float = 5.0
     follow_gain: float = 0.4
     velocity_gain: float = 0.1
