@@ -117,9 +117,9 @@ def requirements() -> list[tuple[str, str, str]]:
         match = _REQUIREMENT.match(line)
         assert match is not None, line
         marked = re.search(r"""extra\s*==\s*['"]([^'"]+)""", match[3] or "")
-        extra = marked[1] if marked else extra
-        if match[1] != "seal-gym" and extra in ("", *_EXTRAS):
-            out.append((match[1], extra, match[2].strip()))
+        wanted_by = marked[1] if marked else extra
+        if match[1] != "seal-gym" and wanted_by in ("", *_EXTRAS):
+            out.append((match[1], wanted_by, match[2].strip()))
     return out
 
 
@@ -424,7 +424,8 @@ def code_hash() -> str:
         f"{name}/{file.relative_to(root).as_posix()}": file
         for name, root in roots.items()
         for file in root.rglob("*")
-        if file.suffix in (".py", ".xml", ".toml") and file != Path(__file__)
+        if file.suffix in (".py", ".xml", ".toml")
+        and file != Path(__file__)
         # of the installed package: its own assets are counted under their own name
         and not (name == "seal_gym" and file.is_relative_to(root / "assets"))
     }
@@ -540,10 +541,13 @@ def compare(found: Rollout, ours: dict[str, Any] | None, quantity: str) -> Verdi
 
 
 MEANING = {
-    "same": "Published numbers hold here to the bit: the commands beside them write the same rows again.",
+    "same": (
+        "To the bit, runs are here what they are where the published numbers were made: the commands beside "
+        "the numbers write the same rows again, where the numbers are of this version."
+    ),
     "last bits": (
-        "Runs differ here from the published ones by rounding only. Expect the published rates and the printed "
-        "digits of RMSE and time; a single trial on the border between two outcomes may end otherwise."
+        "Runs differ here from the published ones by rounding only. Expect the published rates and the "
+        "printed digits of RMSE and time; a trial on the border between two outcomes may end otherwise."
     ),
     "different": (
         "Runs differ here from the published ones. Do not set numbers from this machine against published "
@@ -628,8 +632,8 @@ def _gl_lines(gl: dict[str, Any]) -> list[str]:
         return [
             *lines,
             f"  OpenGL does not work: {gl['error']}",
-            '  Only pictures, videos and renderer="gl" need it. Debian, Ubuntu: apt-get install libegl1 libgl1 '
-            "libgl1-mesa-dri",
+            '  Only pictures, videos and renderer="gl" need it. Debian, Ubuntu: apt-get install libegl1 '
+            "libgl1 libgl1-mesa-dri",
         ]
     kind = "SOFTWARE, slow: no GPU is used" if gl["software"] else "hardware"
     lines.append(f"  OpenGL by {gl['backend']}: {gl['driver']} ({gl['vendor']}, {gl['version']}): {kind}")
@@ -690,7 +694,9 @@ def text(report: dict[str, Any]) -> str:
     Returns:
         Some lines.
     """
-    head = f"seal_gym {report['seal_gym']} on {report['system']} ({report['stack']['machine']}), {report['cpu']}"
+    head = (
+        f"seal_gym {report['seal_gym']} on {report['system']} ({report['stack']['machine']}), {report['cpu']}"
+    )
     parts = [
         [head],
         _package_lines(report),
