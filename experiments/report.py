@@ -326,7 +326,7 @@ def films(sources: list[Path], out: Path) -> list[Media]:
     Raises:
         SealGymError: If a source has none.
     """
-    found = []
+    found: list[Media] = []
     for source in sources:
         files = sorted(source.rglob("*")) if source.is_dir() else [source]
         files = [f for f in files if f.suffix in _VIDEOS and f.is_file()]

@@ -367,7 +367,7 @@ def feature_tables(rows: list[Row]) -> list[Table]:
         The tables, the first shown at once.
     """
     columns = list(dict.fromkeys((row["view"], row["feature"]) for row in rows))
-    tables = []
+    tables: list[Table] = []
     for where in dict.fromkeys(map(place, rows)):
         cells: dict[tuple[str, str], dict[tuple[str, str], Row]] = {}
         for row in rows:

@@ -202,7 +202,7 @@ def probe_gl() -> dict[str, Any]:
 
 
 def _driver() -> dict[str, str]:
-    from OpenGL import GL
+    from OpenGL import GL  # type: ignore[import-untyped]  # ships no types
 
     names = {"vendor": GL.GL_VENDOR, "driver": GL.GL_RENDERER, "version": GL.GL_VERSION}
     return {key: (GL.glGetString(name) or b"?").decode(errors="replace") for key, name in names.items()}
@@ -289,7 +289,7 @@ def _signs(seed: int, rows: int, columns: int) -> Array:
     """Fixed random signs, shape (rows, columns); from raw bits, which no numpy release changes."""
     bits = rows * columns
     raw = np.random.PCG64(seed).random_raw(-(-bits // 64)).astype("<u8")
-    return 2.0 * np.unpackbits(raw.view(np.uint8), count=bits).reshape(rows, columns) - 1.0
+    return np.where(np.unpackbits(raw.view(np.uint8), count=bits).reshape(rows, columns), 1.0, -1.0)
 
 
 class Recorder:
@@ -367,7 +367,7 @@ def rollout(env_id: str, run: str) -> dict[str, Rollout]:
                 if terminated or truncated:
                     break
     finally:
-        env.close()
+        env.close()  # type: ignore[no-untyped-call]  # gymnasium 0.29 leaves it untyped
     found = {run: features.result()}
     return found | {"images": images.result()} if run == "vision" else found
 
@@ -564,12 +564,20 @@ _SEVERITY = ("same", "last bits", "unknown", "different", "broken")
 # -- the report -------------------------------------------------------------------------------------------
 
 
+def _import_without_gl() -> None:
+    """Has MuJoCo imported without OpenGL: rollouts do not use it, and its absence would end the import."""
+    if "mujoco" not in sys.modules:
+        os.environ["MUJOCO_GL"] = "disabled"
+
+
 def examine() -> dict[str, Any]:
     """Looks at everything.
 
     Returns:
         The report as plain data.
     """
+    gl = check_gl()
+    _import_without_gl()
     found, errors = rollouts()
     entries, here = shipped(), stack()
     ours = reference(entries, here)
@@ -591,7 +599,7 @@ def examine() -> dict[str, Any]:
         "cpu": _cpu(),
         "stack": here,
         "packages": [p._asdict() for p in listed],
-        "gl": check_gl(),
+        "gl": gl,
         "reference": None if ours is None else {k: v for k, v in ours.items() if k != "rollouts"},
         "same_code": ours is not None and ours["code"] == code_hash(),
         "shipped_mujoco": sorted({e["stack"]["mujoco"] for e in entries}),
@@ -668,7 +676,7 @@ def _reference_lines(report: dict[str, Any]) -> list[str]:
 
 def _rollout_lines(report: dict[str, Any]) -> list[str]:
     def cell(v: dict[str, Any]) -> str:
-        return v["verdict"] + (f" ({v['rms']:.0e})" if v["rms"] else "")
+        return f"{v['verdict']} ({v['rms']:.0e})" if v["rms"] else str(v["verdict"])
 
     columns = list(QUANTITIES)
     lines = [f"  {'':<24}" + "".join(f"{c:<22}" for c in columns).rstrip()]
@@ -731,6 +739,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     sys.stderr.write("looking (a first time compiles the kernels, which takes tens of seconds) ...\n")
     if options.write_hashes:
+        _import_without_gl()
         found, errors = rollouts()
         for env_id, error in errors.items():
             sys.stderr.write(f"{env_id}: {error}\n")
