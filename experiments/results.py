@@ -87,8 +87,8 @@ def summarise(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     cells: dict[tuple[str, str, int | None], list[dict[str, Any]]] = {}
     for trial in trials:
-        key = (trial["method"], trial["workpiece"], trial["training_seed"])
-        cells.setdefault(key, []).append(trial)
+        cell_of = (trial["method"], trial["workpiece"], trial["training_seed"])
+        cells.setdefault(cell_of, []).append(trial)
     rows = []
     for (method, part, training_seed), cell in cells.items():
         row: dict[str, Any] = {

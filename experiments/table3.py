@@ -179,9 +179,16 @@ def plan(options: argparse.Namespace) -> Plan:
     env = {"perception": options.perception, "renderer": "raycast"}
 
     def cell(method: str, part: str, count: int, of: Weights | None) -> list[Trial]:
-        learned = {"weights": str(of.file), "training_seed": of.training_seed} if of else {}
+        file, training_seed = (str(of.file), of.training_seed) if of else (None, None)
         return [
-            Trial(method=method, workpiece=part, seed=options.seed + k, env=env, **learned)
+            Trial(
+                method=method,
+                workpiece=part,
+                seed=options.seed + k,
+                env=env,
+                weights=file,
+                training_seed=training_seed,
+            )
             for k in range(count)
         ]
 
@@ -269,9 +276,6 @@ def write(what: Plan, ran: tuple[list[Row], list[Row], list[Row]], options: argp
     all_rows = [{k: v for k, v in row.items() if k != "path_mm"} for row in (*main, *seeds_alone, *other)]
     environments, light = trials.shared(all_rows)
     np.savez_compressed(out / f"{NAME}_paths.npz", **first_paths([*main, *other]))
-    document = {"rows": rows, "trials": light}
-    with np.load(out / f"{NAME}_paths.npz", allow_pickle=False) as paths:
-        pictures = table3_figures.draw(out, document, paths)
     results.write(
         out,
         NAME,
@@ -279,7 +283,7 @@ def write(what: Plan, ran: tuple[list[Row], list[Row], list[Row]], options: argp
         light,
         renderer="raycast" if options.perception == "vision" else "none",
         regime="static",
-        text=table3_report.markdown(rows, spreads, pairs, pictures),
+        text=table3_report.markdown(rows, spreads, pairs, table3_figures.names(rows)),
         more={
             "paired": pairs,
             "spread": spreads,
@@ -289,11 +293,12 @@ def write(what: Plan, ran: tuple[list[Row], list[Row], list[Row]], options: argp
     )
     if pairs:
         results.write_csv(out / f"{NAME}_paired.csv", pairs)
-    return results.table(main or other)
+    redraw(out)
+    return results.table(table3_report.of_table(rows, "main") or rows)
 
 
 def redraw(out: Path) -> None:
-    """Draws the figures of a table again.
+    """Draws the figures of a table from its files.
 
     Args:
         out: Its folder.

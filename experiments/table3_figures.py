@@ -52,36 +52,44 @@ def path_name(row: Row) -> str:
     return f"{row['method']}/{row['workpiece']}/{row['seed']}"
 
 
-def draw(out: Path, document: Mapping[str, Any], paths: Paths) -> list[str]:
+def names(rows: Iterable[Row]) -> list[str]:
+    """The files that ``draw`` writes.
+
+    Args:
+        rows: Of the table.
+
+    Returns:
+        Names.
+    """
+    cells = [(row["table"], row["workpiece"]) for row in rows]
+    out = [f"table3_paths_{part}.png" for part in dict.fromkeys(p for table, p in cells if table == "main")]
+    tables = {table for table, _ in cells}
+    out += ["table3_rmse.png"] if "main" in tables else []
+    return out + (["table3_generalisation.png"] if "generalisation" in tables else [])
+
+
+def draw(out: Path, document: Mapping[str, Any], paths: Paths) -> None:
     """Draws all figures.
 
     Args:
         out: The folder.
         document: With the table's ``rows`` and ``trials``.
         paths: By ``path_name``, shape (samples, 3), mm.
-
-    Returns:
-        Names of the files.
     """
     rows, trials = document["rows"], document["trials"]
-    by_path = {path_name(t): t for t in trials if path_name(t) in paths}
-    # Of the training seeds, paths are of the shipped one alone: the first in the document.
-    for t in reversed(trials):
-        if path_name(t) in by_path:
-            by_path[path_name(t)] = t
-    pictures = []
-    main = [row for row in rows if row["table"] == "main"]
-    other = [row for row in rows if row["table"] == "generalisation"]
-    for part in dict.fromkeys(row["workpiece"] for row in main):
-        pictures.append(f"table3_paths_{part}.png")
-        draw_paths(out / pictures[-1], part, by_path, paths)
-    if main:
-        pictures.append("table3_rmse.png")
-        draw_rmse(out / pictures[-1], main, trials)
-    if other:
-        pictures.append("table3_generalisation.png")
-        draw_generalisation(out / pictures[-1], other, by_path, paths)
-    return pictures
+    by_path: dict[str, Row] = {}
+    for t in trials:
+        if path_name(t) in paths:
+            # Paths are the shipped training seed's, whose trials stand before those of the others.
+            by_path.setdefault(path_name(t), t)
+    main, other = ([row for row in rows if row["table"] == name] for name in ("main", "generalisation"))
+    for name in names(rows):
+        if name == "table3_rmse.png":
+            draw_rmse(out / name, main, trials)
+        elif name == "table3_generalisation.png":
+            draw_generalisation(out / name, other, by_path, paths)
+        else:
+            draw_paths(out / name, name.removeprefix("table3_paths_").removesuffix(".png"), by_path, paths)
 
 
 def desired_path(part: str) -> tuple[Array, Array, float]:
@@ -169,7 +177,7 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
         off.axhline(CLEARANCE_MM, color=_GREY, ls="--", lw=1)
         reached = sum(t["reached"] for t in mine.values())
         top.set_title(f"{method}\n{reached} of these {len(mine)} reached the end", fontsize=10)
-        top.set_aspect("equal", adjustable="datalim")
+        top.set_aspect("equal", adjustable="box")
         top.set_xlabel("x of the part [mm]")
         for axes in (side, off):
             axes.set_xlabel("along the seam [mm]")
@@ -267,7 +275,8 @@ def draw_generalisation(path: Path, rows: Sequence[Row], trials: Mapping[str, Ro
     drawn = "neural_rmp" if "neural_rmp" in methods else methods[0]
     cells = {(r["workpiece"], r["method"]): r for r in rows}
     figure = plt.figure(figsize=(8.4 + 1.9 * len(methods), 1.6 + 0.95 * len(parts)), constrained_layout=True)
-    left, middle, right = figure.subfigures(1, 3, width_ratios=(5.2, 1.6 + len(methods), 1.0 + len(methods)))
+    columns: Any = figure.subfigures(1, 3, width_ratios=(5.2, 1.0 + len(methods), 1.0 + len(methods)))
+    left, middle, right = columns
     for k, part in enumerate(parts):
         axes = left.add_subplot(len(parts), 1, k + 1)
         desired, arc, end = desired_path(part)

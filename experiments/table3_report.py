@@ -202,7 +202,7 @@ def markdown(
     if other:
         parts += [
             "## Generalisation: seams of other shape",
-            "Trials that reached the end, of all; below, their mean RMSE in mm. Intervals are in the CSV file.",
+            "Trials that reached the end, of all; below, their mean RMSE in mm. Intervals: see the CSV file.",
             _shape_table(other),
         ]
     if pictures:
