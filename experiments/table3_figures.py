@@ -32,6 +32,7 @@ _COLOURS = {
     "pid_servo": "#8e5bb5",
 }
 _OTHER_COLOUR = "#444444"
+_plain = mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}")
 _OUTCOMES = {
     "reached": ("o", "#2a9d54", "reached the end"),
     "collision": ("X", "#111111", "collision"),
@@ -145,10 +146,12 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
     desired, arc, end = desired_path(part)
     sealed = desired[(arc >= -1e-6) & (arc <= end + 1e-6)]
     sealed_arc = arc[(arc >= -1e-6) & (arc <= end + 1e-6)]
+    width, depth = np.ptp(sealed[:, :2], axis=0)
+    thin = depth < 0.1 * width  # to scale it would be a line
     figure, grid = plt.subplots(
         3,
         len(methods),
-        figsize=(max(3.3 * len(methods), 6.6), 9.6),
+        figsize=(max(2.9 * len(methods), 6.6), 9.2),
         squeeze=False,
         sharex="row",
         sharey="row",
@@ -175,16 +178,18 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
             ):
                 axes.plot(x, y, marker, color=face, mec="white", mew=0.6, ms=7, zorder=5)
         off.axhline(CLEARANCE_MM, color=_GREY, ls="--", lw=1)
+        off.yaxis.set_major_formatter(_plain)
         reached = sum(t["reached"] for t in mine.values())
         top.set_title(f"{method}\n{reached} of these {len(mine)} reached the end", fontsize=10)
-        top.set_aspect("equal", adjustable="box")
+        if not thin:
+            top.set_aspect("equal", adjustable="box")
         top.set_xlabel("x of the part [mm]")
         for axes in (side, off):
             axes.set_xlabel("along the seam [mm]")
         for axes in (top, side, off):
             axes.grid(color="#dddddd", lw=0.6)
     top, side, off = grid[:, 0]
-    top.set_ylabel("from the top: y of the part [mm]")
+    top.set_ylabel(f"from the top{' (stretched)' if thin else ''}: y of the part [mm]")
     side.set_ylabel("from the side: height [mm]")
     off.set_ylabel("distance from the desired path [mm]")
     off.text(0.02, CLEARANCE_MM, "nozzle clearance", color=_GREY, fontsize=8, va="bottom",
@@ -243,6 +248,11 @@ def draw_rmse(path: Path, rows: Sequence[Row], trials: Sequence[Row]) -> None:
             )  # fmt: skip
         axes.set(title=part, xlabel="RMSE [mm]")
         axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(_plain)
+        axes.text(
+            0.985, -0.5, "reached", transform=axes.get_yaxis_transform(),
+            ha="right", va="center", fontsize=8, color="#333333",
+        )  # fmt: skip
         axes.grid(axis="x", which="both", color="#e3e3e3", lw=0.6)
     low, high = panels[0, 0].get_xlim()
     panels[0, 0].set_xlim(low, high * (high / low) ** 0.35)  # room for the counts
@@ -275,10 +285,9 @@ def draw_generalisation(path: Path, rows: Sequence[Row], trials: Mapping[str, Ro
     drawn = "neural_rmp" if "neural_rmp" in methods else methods[0]
     cells = {(r["workpiece"], r["method"]): r for r in rows}
     figure = plt.figure(figsize=(8.4 + 1.9 * len(methods), 1.6 + 0.95 * len(parts)), constrained_layout=True)
-    columns: Any = figure.subfigures(1, 3, width_ratios=(5.2, 1.0 + len(methods), 1.0 + len(methods)))
-    left, middle, right = columns
+    grid = figure.add_gridspec(len(parts), 3, width_ratios=(5.0, 0.6 + len(methods), 0.6 + len(methods)))
     for k, part in enumerate(parts):
-        axes = left.add_subplot(len(parts), 1, k + 1)
+        axes = figure.add_subplot(grid[k, 0])
         desired, arc, end = desired_path(part)
         sealed = desired[(arc >= -1e-6) & (arc <= end + 1e-6)]
         rise = part == "ramp"  # seen from the side: from the top it is a straight line
@@ -296,16 +305,17 @@ def draw_generalisation(path: Path, rows: Sequence[Row], trials: Mapping[str, Ro
             f"{shapes.TITLES[part]}{' (side view)' if rise else ''}".replace(", ", ",\n"),
             rotation=0, ha="right", va="center", fontsize=9,
         )  # fmt: skip
-    left.suptitle(f"shapes, and paths of {drawn}", fontsize=11)
-    for sub, key, title, digits in (
-        (middle, "reached_pct", "reached the end [%]", 0),
-        (right, "rmse_mm", "RMSE of those that did [mm]", 3),
+        if k == 0:
+            axes.set_title(f"shapes, and paths of {drawn}", fontsize=11)
+    for column, (key, title, digits) in enumerate(
+        (("reached_pct", "reached the end [%]", 0), ("rmse_mm", "RMSE of those that did [mm]", 3)), start=1
     ):
         values = np.array(
             [[np.nan if cells[p, m][key] is None else cells[p, m][key] for m in methods] for p in parts]
         )
-        _heat_map(sub.subplots(), values, methods, digits, share=key == "reached_pct")
-        sub.suptitle(title, fontsize=11)
+        axes = figure.add_subplot(grid[:, column])
+        _heat_map(axes, values, methods, digits, share=key == "reached_pct")
+        axes.set_title(title, fontsize=11)
     trials_each = sorted({r["trials"] for r in rows})
     figure.suptitle(f"Seams of other shape, {' or '.join(map(str, trials_each))} trials each")
     figure.savefig(path, dpi=105)

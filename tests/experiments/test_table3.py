@@ -170,7 +170,9 @@ def test_the_whole_table_is_the_protocols(tmp_path):
         assert all(t.env == {"perception": "vision", "renderer": "raycast"} for t in group)
 
 
-def test_missing_weights_are_an_error_that_says_how_to_train(tmp_path, capsys):
+def test_missing_weights_are_an_error_that_says_how_to_train(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(agents.POLICIES, "neural_rmp_dagger", agents.POLICIES["neural_rmp"])
+    monkeypatch.delitem(agents.POLICIES, "pid_servo", raising=False)
     folder = weights(tmp_path / "w", seeds=(0, 1), kinds=("neural_rmp",))
     out = tmp_path / "out"
     assert table3.main(["--weights", str(folder), "--out", str(out)]) == 2
@@ -178,8 +180,9 @@ def test_missing_weights_are_an_error_that_says_how_to_train(tmp_path, capsys):
     assert "neural_rmp: neural_rmp-seed2.safetensors missing" in said
     assert "neural_control: neural_control.safetensors, neural_control-seed0" in said
     assert "agents.train_bc --policy neural_control --seed S" in said
-    assert "neural_rmp_dagger" in said
-    assert "--dagger" in said
+    assert "neural_rmp_dagger: neural_rmp_dagger.safetensors missing" in said
+    assert "--policy neural_rmp --dagger 3" in said
+    assert "pid_servo: no policy of that name" in said
     assert not out.exists()
 
 
