@@ -249,13 +249,15 @@ def draw_rmse(path: Path, rows: Sequence[Row], trials: Sequence[Row]) -> None:
         axes.set(title=part, xlabel="RMSE [mm]")
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(_plain)
+        axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
         axes.text(
             0.985, -0.5, "reached", transform=axes.get_yaxis_transform(),
             ha="right", va="center", fontsize=8, color="#333333",
         )  # fmt: skip
         axes.grid(axis="x", which="both", color="#e3e3e3", lw=0.6)
-    low, high = panels[0, 0].get_xlim()
-    panels[0, 0].set_xlim(low, high * (high / low) ** 0.35)  # room for the counts
+    low, high = np.log10(panels[0, 0].get_xlim())
+    low, high = np.floor(low), max(high, np.floor(low) + 1.0)
+    panels[0, 0].set_xlim(10.0**low, 10.0 ** (high + 0.35 * (high - low)))  # room for the counts
     panels[0, 0].set_yticks(range(len(methods)), methods)
     panels[0, 0].set_ylim(len(methods) - 0.4, -0.6)
     figure.suptitle(
