@@ -18,7 +18,7 @@ LENGTH_MM = {
     "inner_corner": 160.0 - 60.0 + 30.0 * np.pi / 2,
     # Three sides of 50 mm, two turns of 60 deg on 5 mm.
     "hexagon": 150.0 + 2 * (5.0 * np.pi / 3 - 2 * 5.0 / T60),
-    # Level and up by 10 deg over 80 mm each; so small a turn becomes the largest arc that fits: 40 mm of each.
+    # Level and up by 10 deg over 80 mm each; so small a turn becomes the largest arc, of 40 mm each.
     "ramp": 80.0 / np.cos(T10) + 40.0 / np.tan(T10 / 2) * T10,
     # Half the circumference by Ramanujan's second formula.
     "ellipse": np.pi / 2 * 100.0 * (1 + 3 * 0.04 / (10 + np.sqrt(4 - 3 * 0.04))),
