@@ -12,21 +12,29 @@ to mm and degrees which the observation has applied already.
 | side view, angle | theta_side | turning about x |
 | front view, angle | -theta_front | turning about z |
 
-Each loop asks for a velocity, ``u = kp e + ki integral(e) + kd de/dt``, bounded; a speed loop makes of it the
-acceleration ``k (u - v)`` that ``control="tip"`` takes. Along y the travel speed is fed forward to the speed
-loop; about y, which no feature sees, the lean is restored as the expert's fixed leaves do it. ``de/dt`` comes
-from the tip's measured velocity and the estimated motion of the seam, both in the observation, through the
-interaction matrix: differences of the features would be the same but for their noise. On one axis, at rest
-and with ki = 0, the error follows ``e'' + k (1 + kd) e' + k kp e = 0``.
+Each loop asks for a velocity, ``u = (kp + ki/kp) e + ki integral(e) + kd de/dt``, bounded; a speed loop makes
+of it the acceleration ``k (u - v)`` that ``control="tip"`` takes. Along y the travel speed is fed forward to
+the speed loop; about y, which no feature sees, the lean is restored as the expert's fixed leaves do it.
+``de/dt`` comes from the tip's measured velocity and the estimated motion of the seam, both in the
+observation, through the interaction matrix: differences of the features would be the same but for their
+noise. On one axis of a part at rest the error follows
+``e'' + k (1 + kd) e' + k (kp + ki/kp) e + k ki integral(e) = 0``; behind a seam that moves steadily it lags by
+v/kp with ki = 0, and not at all with ki > 0.
 
-Anti-windup: a loop whose velocity is at its bound does not integrate further in that direction. While a view
-is lost the features are old: every axis is brought to rest, and the integrals wait.
+Anti-windup, by preloading: at the start, and while a loop's velocity is at its bound, its integral term is
+kept at ``-(ki/kp) e``, so that ``u = kp e + kd de/dt`` and only what the proportional part leaves over is
+integrated from there on. Otherwise each approach from the hover would wind the integral up, and the seam
+would be overshot, slowly. While a view is lost the features are old: every axis is brought to rest, and the
+integrals wait.
 
 Tuning. ``python -m agents.pid_servo --tune`` tries the gains one after the other over the short lists in
-``GRID``, two rounds, on flat and cylinder by vision, seeds 500000 to 500005, the part at rest; the first
-criterion is how many trials reach the end, the second the mean of their RMSE. Distances share their gains, as
-do angles: their axes are alike. ``PidServoCfg`` holds what came out of it. The bounds of the velocities are
-the expert's own, not tuned. The rectangular part and moving parts had no say.
+``GRID``, two rounds at most, on flat and cylinder by vision, the part at rest: seeds 500000 to 500003, the
+first 12 s of each run, which hold all there is on these parts. First counts how many runs fail, then the mean
+of the RMSE from 10 mm of travel on. With so few runs a difference below 3 % says nothing: of the values
+within it the largest is kept, because a stiffer loop follows a seam that turns or moves faster. Distances
+share their gains, as do angles: their axes are alike. The defaults of ``PidServoCfg`` are what came out, and
+where the command starts. The velocities' bounds are the expert's own, not tuned. The rectangular part and
+moving parts had no say.
 """
 
 import argparse
@@ -38,7 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seal_gym.core.cell import CellCfg, load_cell
-from seal_gym.core.errors import ConfigError, is_number, require
+from seal_gym.core.errors import is_number, require
 from seal_gym.core.frames import Array
 from seal_gym.envs.core import FEATURES
 from seal_gym.rmp import (
@@ -55,13 +63,14 @@ X, Y, Z, ABOUT_X, ABOUT_Y, ABOUT_Z = range(6)
 AXES = (X, Z, ABOUT_X, ABOUT_Z)  # that the loops act on, in the order of ``PidServoCfg``
 FIRST_SEED = 500_000  # protocol.md: tuning from here on, tables from 1,000,000
 PARTS = ("flat", "cylinder")
+_ALIKE = 1.03  # RMSEs within this factor of the best are as good
 _FIRST_ARC_M = 0.010  # where protocol.md begins to count errors
 GRID = {
     "speed_s": (8.0, 12.0, 16.0),
-    "distance.kp_s": (3.0, 6.0, 9.0),
+    "distance.kp_s": (6.0, 9.0, 12.0),
     "distance.ki_s2": (0.0, 4.0, 12.0),
     "distance.kd": (0.0, 0.3),
-    "angle.kp_s": (3.0, 6.0, 9.0),
+    "angle.kp_s": (3.0, 6.0, 9.0, 12.0),
     "angle.ki_s2": (0.0, 4.0, 12.0),
     "angle.kd": (0.0, 0.3),
 }
@@ -73,7 +82,7 @@ class LoopCfg:
     """A PID loop from a feature's error to a velocity.
 
     Attributes:
-        kp_s: Velocity for the error [1/s].
+        kp_s: Velocity for the error while nothing has been integrated [1/s].
         ki_s2: Velocity for the error's integral [1/s^2].
         kd: Velocity for the error's rate.
         max_rate: Bound on the velocity [m/s or rad/s].
@@ -94,8 +103,8 @@ class LoopCfg:
             )
 
 
-_DISTANCE = LoopCfg(kp_s=6.0, ki_s2=4.0, kd=0.3, max_rate=0.025)
-_ANGLE = LoopCfg(kp_s=6.0, ki_s2=4.0, kd=0.3, max_rate=1.0)
+_DISTANCE = LoopCfg(kp_s=9.0, ki_s2=4.0, kd=0.3, max_rate=0.025)
+_ANGLE = LoopCfg(kp_s=9.0, ki_s2=4.0, kd=0.3, max_rate=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,8 +180,8 @@ class PidServo:
             deterministic: The servo always is.
 
         Returns:
-            Actions of shape (6,) or (N, 6), and the integrals: velocities in the order of ``AXES``, shape
-            (N, 4), m/s and rad/s.
+            Actions of shape (6,) or (N, 6), and the integral terms: velocities in the order of ``AXES``, NaN
+            before a row has seen anything, shape (N, 4), m/s and rad/s.
         """
         del deterministic
         features = observation["features"] if isinstance(observation, dict) else observation
@@ -199,18 +208,20 @@ class PidServo:
     def _loops(
         self, errors: SeamErrors, twist: Array, seam: Array, integral: Array, seen: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
-        """Velocities on ``AXES`` and the integrals after the frame, shape (N, 4) each."""
+        """Velocities on ``AXES`` and the integral terms after the frame, shape (N, 4) each."""
         error = axis_errors(errors)[:, AXES]
         rate = (seam - twist)[:, AXES]
         # Travelling at an angle to the seam moves it sideways in the view.
         rate[:, 0] += twist[:, Y] * np.sin(errors.theta_front)
         rate[:, 1] += twist[:, Y] * np.sin(errors.theta_side)
-        grown = integral + self._ki * self._cell.timing.frame_s * error
-        asked = self._kp * error + grown + self._kd * rate
-        winding = (np.abs(asked) > self._bound) & (asked * error > 0.0)
-        grown = np.where(winding, integral, np.clip(grown, -self._bound, self._bound))
-        velocity = np.clip(self._kp * error + grown + self._kd * rate, -self._bound, self._bound)
-        return np.where(seen[:, None], velocity, 0.0), np.where(seen[:, None], grown, integral)
+        preload = -self._ki / self._kp * error
+        begun = np.where(np.isnan(integral), preload, integral)
+        grown = begun + self._ki * self._cell.timing.frame_s * error
+        asked = self._kp * error - preload + grown + self._kd * rate
+        bounded = np.abs(asked) > self._bound
+        velocity = np.clip(asked, -self._bound, self._bound)
+        after = np.where(bounded, preload, grown)
+        return np.where(seen[:, None], velocity, 0.0), np.where(seen[:, None], after, integral)
 
     def _lean(self, errors: SeamErrors, twist: Array, last_accel: Array) -> Array:
         """What the expert's fixed leaves make of the lean, shape (N,), rad/s^2."""
@@ -227,16 +238,16 @@ def _seam_twist(o: Array) -> Array:
 
 
 def _integrals(state: Array | None, episode_start: NDArray[np.bool_] | None, n: int) -> Array:
-    """The integrals before a frame, zero where an episode starts, shape (n, 4)."""
+    """The integral terms before a frame, NaN where an episode starts, shape (n, 4)."""
     if state is None:
-        return np.zeros((n, len(AXES)))
+        return np.full((n, len(AXES)), np.nan)
     require(
         np.shape(state) == (n, len(AXES)),
         f"state has shape {np.shape(state)}: must be ({n}, {len(AXES)}), what the last predict gave, or None",
     )
     if episode_start is None:
         return np.asarray(state, dtype=np.float64)
-    return np.where(np.reshape(episode_start, (n, 1)), 0.0, state)
+    return np.where(np.reshape(episode_start, (n, 1)), np.nan, state)
 
 
 # -- tuning -----------------------------------------------------------------------------------------------
@@ -370,7 +381,9 @@ def tune(judge: Callable[[PidServoCfg], tuple[int, float]], rounds: int = 2) -> 
                 print(
                     f"round {k + 1}  {name} = {gain_of(cfg, name):<4g}  failed {failed}  RMSE {rmse:.4f} mm"
                 )
-            best = min(tried, key=judge)
+            least = min(map(judge, tried))
+            alike = [cfg for cfg in tried if judge(cfg) <= (least[0], _ALIKE * least[1])]
+            best = max(alike, key=lambda cfg: gain_of(cfg, name))
             print(f"round {k + 1}  {name} = {gain_of(best, name):g} is kept", flush=True)
         if best == before:
             break

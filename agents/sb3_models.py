@@ -219,8 +219,8 @@ def _plain(holds: bool, path: Path, why: str) -> None:
     require(
         holds,
         f"{path.name} cannot be loaded without running the code that may be in it: {why}. Train with "
-        "`python -m agents.train_sb3`, which writes policy.safetensors; or, if you trust where the file comes "
-        "from, load_policy(..., trust_zip=True)",
+        "`python -m agents.train_sb3`, which writes policy.safetensors; or, if you trust where the file "
+        "comes from, load_policy(..., trust_zip=True)",
         PolicyFileError,
     )
 
@@ -238,6 +238,8 @@ def _parameters(path: Path) -> dict[str, Tensor]:
             if archive.getinfo("policy.pth").file_size > _LONGEST_PARAMETERS:
                 raise PolicyFileError(f"{path.name} is no model of ours: it has too many parameters")
             data = io.BytesIO(archive.read("policy.pth"))
+        if not zipfile.is_zipfile(data):  # torch's present format; the old one is a row of bare pickles
+            raise zipfile.BadZipFile("not torch's format")
         tensors = torch.load(data, map_location="cpu", weights_only=True)
     except OSError as error:
         raise PolicyFileError(f"{path} cannot be read ({error.strerror})") from error

@@ -161,7 +161,7 @@ class Squared(torch.nn.Module):
         (
             {},
             {"policy_kwargs": {"squash_output": False, "full_std": True}},
-            "policy_kwargs have 'squash_output'",
+            "policy_kwargs have 'squash",
         ),
         ({}, {"use_sde": True}, "gSDE"),
         ({"observation": "features+images"}, {"policy": "MultiInputPolicy"}, "is not PPO's MlpPolicy"),
