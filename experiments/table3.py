@@ -89,7 +89,7 @@ def how_to_train(method: str) -> str:
     dagger = " --dagger 3" if method.endswith(_DAGGER) else ""
     return (
         "python -m agents.collect --episodes 2400 --jobs 2 --out DATA; "
-        f"python -m agents.train_bc --policy {kind}{dagger} --seed S --data DATA --out RUN --validate 50"
+        f"python -m agents.train_bc --policy {kind}{dagger} --seed S --data DATA --out RUN --validate 20"
     )
 
 
@@ -123,7 +123,7 @@ def find_weights(folder: Path, method: str, training_seeds: Sequence[int]) -> tu
             require(
                 new.sha256 == found[0].sha256,
                 f"{shipped.name} and {file.name} are both of training seed {new.training_seed}, but differ: "
-                "copy them again with agents.train_bc.ship",
+                "copy them again with agents.ship",
             )
             continue
         found.append(new)
@@ -156,7 +156,7 @@ def check_methods(methods: Sequence[str], folder: Path, training_seeds: Sequence
     if problems:
         lines = "\n  ".join(problems)
         raise ConfigError(
-            f"in {folder}:\n  {lines}\n  then agents.train_bc.ship copies the seeds; or name the methods to "
+            f"in {folder}:\n  {lines}\n  then agents.ship copies the seeds; or name the methods to "
             "run with --method (and their --training-seeds)"
         )
     return weights
