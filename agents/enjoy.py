@@ -3,8 +3,8 @@
     python -m agents.enjoy --policy rmp_expert --env SealGym/Cylinder-v0 --episodes 3 --video out/expert.mp4
 
 ``--policy`` takes a name (``rmp_expert``, ...), a ``.safetensors`` file of ``agents.train_bc`` or
-``agents.train_sb3`` (or the folder of such a run), or a ``.zip`` that Stable-Baselines3 saved. Nothing in such
-a file is executed.
+``agents.train_sb3`` (or the folder of such a run), or a ``.zip`` that Stable-Baselines3 saved. Nothing in
+such a file is executed.
 """
 
 from agents import backend
