@@ -18,7 +18,7 @@ the speed loop; about y, which no feature sees, the lean is restored as the expe
 ``de/dt`` comes from the tip's measured velocity and the estimated motion of the seam, both in the
 observation, through the interaction matrix: differences of the features would be the same but for their
 noise. On one axis of a part at rest the error follows
-``e'' + k (1 + kd) e' + k (kp + ki/kp) e + k ki integral(e) = 0``; behind a seam that moves steadily it lags by
+``e'' + k (1 + kd) e' + k (kp + ki/kp) e + k ki integral(e) = 0``; behind a seam in steady motion it lags by
 v/kp with ki = 0, and not at all with ki > 0.
 
 Anti-windup, by preloading: at the start, and while a loop's velocity is at its bound, its integral term is
