@@ -62,7 +62,7 @@ def _pid_servo(cell: "CellCfg | None") -> Policy:
 def _learned(name: str, dagger: int = 0) -> Callable[["CellCfg | None"], Policy]:
     """Makes a shipped policy; its kind is its name, without ``_dagger``."""
     kind = name.removesuffix("_dagger")
-    rounds = f" --dagger {dagger}" if dagger else ""
+    rounds = f" --dagger {dagger} --dagger-episodes 50 --dagger-epochs 6" if dagger else ""
 
     def make(cell: "CellCfg | None") -> Policy:
         path = WEIGHTS / f"{name}.safetensors"

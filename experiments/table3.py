@@ -86,7 +86,7 @@ def how_to_train(method: str) -> str:
         For a shell.
     """
     kind = method.removesuffix(_DAGGER)
-    dagger = " --dagger 3" if method.endswith(_DAGGER) else ""
+    dagger = " --dagger 3 --dagger-episodes 50 --dagger-epochs 6" if method.endswith(_DAGGER) else ""
     return (
         "python -m agents.collect --episodes 2400 --jobs 2 --out DATA; "
         f"python -m agents.train_bc --policy {kind}{dagger} --seed S --data DATA --out RUN --validate 20"
