@@ -32,9 +32,11 @@ Tuning. ``python -m agents.pid_servo --tune`` tries the gains one after the othe
 first 12 s of each run, which hold all there is on these parts. First counts how many runs fail, then the mean
 of the RMSE from 10 mm of travel on. With so few runs a difference below 3 % says nothing: of the values
 within it the largest is kept, because a stiffer loop follows a seam that turns or moves faster. Distances
-share their gains, as do angles: their axes are alike. The defaults of ``PidServoCfg`` are what came out, and
-where the command starts. The velocities' bounds are the expert's own, not tuned. The rectangular part and
-moving parts had no say.
+share their gains, as do angles: their axes are alike. The lists end where the loops would be stiffer than the
+expert's leaves. They leave out a distance loop without integral, which is 4 % better on parts at rest (0.0435
+against 0.0455 mm) and on a part that moves at 10 mm/s nearly 1 mm behind. The defaults of ``PidServoCfg`` are
+what came out, and where the command starts. The velocities' bounds are the expert's own, not tuned. The
+rectangular part and moving parts had no say.
 """
 
 import argparse
@@ -68,10 +70,10 @@ _FIRST_ARC_M = 0.010  # where protocol.md begins to count errors
 GRID = {
     "speed_s": (8.0, 12.0, 16.0),
     "distance.kp_s": (6.0, 9.0, 12.0),
-    "distance.ki_s2": (0.0, 4.0, 12.0),
+    "distance.ki_s2": (4.0, 12.0),
     "distance.kd": (0.0, 0.3),
-    "angle.kp_s": (3.0, 6.0, 9.0, 12.0),
-    "angle.ki_s2": (0.0, 4.0, 12.0),
+    "angle.kp_s": (6.0, 9.0, 12.0),
+    "angle.ki_s2": (4.0, 12.0),
     "angle.kd": (0.0, 0.3),
 }
 """What ``--tune`` tries; ``distance`` stands for both distances, ``angle`` for both angles."""
@@ -103,8 +105,8 @@ class LoopCfg:
             )
 
 
-_DISTANCE = LoopCfg(kp_s=9.0, ki_s2=4.0, kd=0.3, max_rate=0.025)
-_ANGLE = LoopCfg(kp_s=9.0, ki_s2=4.0, kd=0.3, max_rate=1.0)
+_DISTANCE = LoopCfg(kp_s=12.0, ki_s2=4.0, kd=0.3, max_rate=0.025)
+_ANGLE = LoopCfg(kp_s=12.0, ki_s2=4.0, kd=0.3, max_rate=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +126,7 @@ class PidServoCfg:
     d_side: LoopCfg = _DISTANCE
     theta_side: LoopCfg = _ANGLE
     theta_front: LoopCfg = _ANGLE
-    speed_s: float = 12.0
+    speed_s: float = 16.0
     sealing: SealingCfg = field(default_factory=SealingCfg)
 
     def __post_init__(self) -> None:
@@ -265,10 +267,11 @@ def with_gain(cfg: PidServoCfg, name: str, value: float) -> PidServoCfg:
         Its configuration.
     """
     group, _, gain = name.partition(".")
-    if not gain:
-        return replace(cfg, **{group: value})
+    if name == "speed_s":
+        return replace(cfg, speed_s=value)
     loops = {"distance": ("d_front", "d_side"), "angle": ("theta_front", "theta_side")}[group]
-    return replace(cfg, **{loop: replace(getattr(cfg, loop), **{gain: value}) for loop in loops})
+    changed: dict[str, Any] = {loop: replace(getattr(cfg, loop), **{gain: value}) for loop in loops}
+    return replace(cfg, **changed)
 
 
 def gain_of(cfg: PidServoCfg, name: str) -> float:

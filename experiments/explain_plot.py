@@ -133,7 +133,7 @@ def plot_story(path: Path, title: str, found: Story) -> None:
     curves = _curves(found)
     heights = [3.0, *([1.5] * len(pairs)), *([1.2] * len(curves)), 1.0]
     figure = plt.figure(figsize=(14.0, 1.7 * sum(heights) + 0.6), constrained_layout=True)
-    figure.suptitle(f"{title}: what the policy asked for, where it insists and where it yields", fontsize=13)
+    figure.suptitle(f"{title}\nwhat the policy asked for: where it insists and where it yields", fontsize=13)
     rows = figure.add_gridspec(len(heights), 2, height_ratios=heights)
     _from_above(figure.add_subplot(rows[0, :]), found, at)
     for r, pair in enumerate(pairs, start=1):
@@ -269,15 +269,15 @@ def _curves(found: Story) -> list[tuple[str, tuple[Curves, Curves], bool]]:
         ]
         return [*pale, *((f"resolved, {name}", v, style) for name, v, style in three(found.resolved, part))]
 
+    def weights(part: int) -> Curves:
+        eigen = np.linalg.eigvalsh(found.metric[:, part : part + 3, part : part + 3])
+        broad = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
+        pale: Curves = [("eigenvalues" if k == 0 else "_", eigen[:, k], broad) for k in range(3)]
+        return pale + three(diagonal, part)
+
     rows = [("f and resolved", (wanted(0), wanted(3)), True)]
     if found.has_metric:
-        eigen = [np.linalg.eigvalsh(found.metric[:, p, p]) for p in (slice(0, 3), slice(3, 6))]
-        light = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
-        metric = tuple(
-            [("eigenvalues" if k == 0 else "_", e[:, k], light) for k in range(3)] + three(diagonal, part)
-            for e, part in zip(eigen, (0, 3), strict=True)
-        )
-        rows.append(("A, diagonal", (metric[0], metric[1]), False))
+        rows.append(("A, diagonal", (weights(0), weights(3)), False))
         rows.append(("share of the policy", (three(found.share, 0), three(found.share, 3)), False))
     seen = np.where(found.valid, 1.0, np.nan)
     views = (("front", _COLOURS[0]), ("side", _COLOURS[2]))

@@ -143,7 +143,7 @@ def test_each_feature_drives_its_own_axis():
 def test_travel_is_fed_forward_and_the_lean_restored_as_by_the_fixed_leaves():
     a, _ = accel(servo(), observation())
     assert a[1] == pytest.approx(10.0 * 0.010, rel=1e-6)  # k (v_ref - 0)
-    # Lean 0.1 (k sat(e) - c w), damping .25 (-c w), regularisation .05 (0): by hand, e small against its bound.
+    # Lean 0.1 (k sat(e) - c w), damping .25 (-c w), regularisation .05 (0).
     e = np.deg2rad(0.5)
     c = 2.0 * 2.1 * 4.0
     k = 4.0**2 * (1.0 + 0.25 / 0.1)
