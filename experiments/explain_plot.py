@@ -270,8 +270,8 @@ def _curves(found: Story) -> list[tuple[str, tuple[Curves, Curves], bool]]:
         return [*pale, *((f"resolved, {name}", v, style) for name, v, style in three(found.resolved, part))]
 
     def weights(part: int) -> Curves:
-        eigen = np.linalg.eigvalsh(found.metric[:, part : part + 3, part : part + 3])
-        broad = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
+        eigen: Any = np.linalg.eigvalsh(found.metric[:, part : part + 3, part : part + 3])
+        broad: Any = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
         pale: Curves = [("eigenvalues" if k == 0 else "_", eigen[:, k], broad) for k in range(3)]
         return pale + three(diagonal, part)
 
