@@ -34,9 +34,9 @@ of the RMSE from 10 mm of travel on. With so few runs a difference below 3 % say
 within it the largest is kept, because a stiffer loop follows a seam that turns or moves faster. Distances
 share their gains, as do angles: their axes are alike. The lists end where the loops would be stiffer than the
 expert's leaves. They leave out a distance loop without integral, which is 4 % better on parts at rest (0.0435
-against 0.0455 mm) and nearly 1 mm behind on a part that moves at 10 mm/s. The defaults of ``PidServoCfg`` are
-what came out, and where the command starts. The velocities' bounds are the expert's own, not tuned. The
-rectangular part and moving parts had no say.
+against 0.0455 mm) and on a part that moves at 10 mm/s nearly 1 mm behind. The defaults of ``PidServoCfg`` are
+what came out, and where the command starts. The velocities' bounds are not tuned: along x and z the expert's,
+about x and z what the arm's joints can turn at. The rectangular part and moving parts had no say.
 """
 
 import argparse
@@ -106,7 +106,7 @@ class LoopCfg:
 
 
 _DISTANCE = LoopCfg(kp_s=12.0, ki_s2=4.0, kd=0.3, max_rate=0.025)
-_ANGLE = LoopCfg(kp_s=12.0, ki_s2=4.0, kd=0.3, max_rate=1.0)
+_ANGLE = LoopCfg(kp_s=12.0, ki_s2=12.0, kd=0.3, max_rate=3.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,10 +267,11 @@ def with_gain(cfg: PidServoCfg, name: str, value: float) -> PidServoCfg:
         Its configuration.
     """
     group, _, gain = name.partition(".")
-    if not gain:
-        return replace(cfg, **{group: value})
+    if name == "speed_s":
+        return replace(cfg, speed_s=value)
     loops = {"distance": ("d_front", "d_side"), "angle": ("theta_front", "theta_side")}[group]
-    return replace(cfg, **{loop: replace(getattr(cfg, loop), **{gain: value}) for loop in loops})
+    changed: dict[str, Any] = {loop: replace(getattr(cfg, loop), **{gain: value}) for loop in loops}
+    return replace(cfg, **changed)
 
 
 def gain_of(cfg: PidServoCfg, name: str) -> float:

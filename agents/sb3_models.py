@@ -240,6 +240,7 @@ def _parameters(path: Path) -> dict[str, Tensor]:
             data = io.BytesIO(archive.read("policy.pth"))
         if not zipfile.is_zipfile(data):  # torch's present format; the old one is a row of bare pickles
             raise zipfile.BadZipFile("not torch's format")
+        data.seek(0)
         tensors = torch.load(data, map_location="cpu", weights_only=True)
     except OSError as error:
         raise PolicyFileError(f"{path} cannot be read ({error.strerror})") from error

@@ -80,12 +80,12 @@ class Decision(NamedTuple):
     @property
     def accel(self) -> Array:
         """The policy's f [m/s^2, rad/s^2]. Shape (6,)."""
-        return self.policies["policy"].accel[0]
+        return np.asarray(self.policies["policy"].accel[0])
 
     @property
     def metric(self) -> Array:
         """The policy's A; zero if it has none. Shape (6, 6)."""
-        return self.policies["policy"].metric[0]
+        return np.asarray(self.policies["policy"].metric[0])
 
     @property
     def share(self) -> Array:
@@ -120,13 +120,16 @@ def decide(core: SealCore, action: NDArray[np.float32]) -> Decision:
     return Decision(policies, tip_acceleration(adapter(given, state), state)[0])
 
 
-def watch(env: SealEnv, policy: agents.Policy, seed: int) -> Iterator[tuple[inspect.Frame, Decision]]:
+def watch(
+    env: SealEnv, policy: agents.Policy, seed: int, ended: dict[str, Any]
+) -> Iterator[tuple[inspect.Frame, Decision]]:
     """Runs an episode.
 
     Args:
         env: Where.
         policy: Acts in it.
         seed: Of the episode.
+        ended: Filled with ``episode_metrics`` at the end.
 
     Yields:
         Each frame in which the policy acted, and what it decided.
@@ -137,8 +140,9 @@ def watch(env: SealEnv, policy: agents.Policy, seed: int) -> Iterator[tuple[insp
         action, state = policy.predict(observation, state=state, episode_start=start)
         decision = decide(env.core, action)
         yield replace(inspect.look(env.core), leaves=decision.policies), decision
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
         start, done = np.array([False]), terminated or truncated
+    ended.update(info["episode_metrics"])
 
 
 class Writer(recording.Writer):
@@ -360,7 +364,10 @@ def explain(options: argparse.Namespace) -> Story:
     else:
         sys.stderr.write(f"no recording: {missing}\n")
     frames: list[tuple[inspect.Frame, Decision]] = []
-    for k, (frame, decision) in enumerate(tqdm(watch(env, policy, options.seed), desc=stem, unit="frame")):
+    ended: dict[str, Any] = {}
+    for k, (frame, decision) in enumerate(
+        tqdm(watch(env, policy, options.seed, ended), desc=stem, unit="frame")
+    ):
         full = k % options.every == 0
         if writer:
             writer.add(k, frame, full=full)
@@ -371,7 +378,7 @@ def explain(options: argparse.Namespace) -> Story:
         writer.close()
     sealed = seam.at(np.linspace(0.0, seam.length, 1000))
     found = story(frames, seam.corners, sealed.position + scene.cell.process.stand_off_m * sealed.approach)
-    title = f"{short}, {name}, {options.perception}, seed {options.seed}"
+    title = f"{short}, {name}, {options.perception}, seed {options.seed}, ended: {ended['outcome']}"
     plot_story(options.out / f"{stem}.png", title, found)
     return found
 

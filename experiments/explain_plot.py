@@ -20,6 +20,8 @@ _COLOURS = ("#d6332a", "#2f9e44", "#2f6fd6")  # x, y, z, and the turns about the
 _GREY, _BLACK, _CORNER = "#8a8f98", "#222222", "#f2d9a0"
 _FIRST_MM = 10.0  # where protocol.md begins to count errors
 _STATIONS = 8
+_LEAST = (0.01, 1.0)  # smallest range shown of accelerations [m/s^2, rad/s^2]: below, all is rest
+_LEAST_FEATURES = (0.05, 0.5)  # of features [mm, deg]
 _ARROW_MM = 16.0  # length of the longest arrow in the view from above
 _ARROW, _SMALLEST_ARROW = "#c2255c", 0.05
 _GLYPHS = (
@@ -133,7 +135,7 @@ def plot_story(path: Path, title: str, found: Story) -> None:
     curves = _curves(found)
     heights = [3.0, *([1.5] * len(pairs)), *([1.2] * len(curves)), 1.0]
     figure = plt.figure(figsize=(14.0, 1.7 * sum(heights) + 0.6), constrained_layout=True)
-    figure.suptitle(f"{title}: what the policy asked for, where it insists and where it yields", fontsize=13)
+    figure.suptitle(f"{title}\nwhat the policy asked for: where it insists and where it yields", fontsize=13)
     rows = figure.add_gridspec(len(heights), 2, height_ratios=heights)
     _from_above(figure.add_subplot(rows[0, :]), found, at)
     for r, pair in enumerate(pairs, start=1):
@@ -184,7 +186,7 @@ def _from_above(axes: Any, found: Story, at: list[int]) -> None:
     going = found.sealing[::step]
     size = np.linalg.norm(f, axis=1)
     full = float(np.quantile(size[going], 0.98)) if going.any() else float(size.max())
-    full = max(full, 1e-6)
+    full = max(full, _LEAST[0])
     arrows = _ARROW_MM / full * f * np.minimum(1.0, full / np.maximum(size, 1e-12))[:, None]
     axes.quiver(
         *tip[::step].T,
@@ -197,9 +199,8 @@ def _from_above(axes: Any, found: Story, at: list[int]) -> None:
         zorder=4,
         label=f"f of the policy, {_ARROW_MM:.0f} mm for {full:.2g} m/s$^2$ and more",
     )
-    middle = found.desired_mm[:, :2].mean(axis=0)
     for k, i in enumerate(at):
-        away = tip[i] - middle
+        away = found.tip_pose[i, :2, 0]  # right of travel: the free side
         away = away / max(float(np.linalg.norm(away)), 1e-9)
         axes.annotate(
             str(k + 1),
@@ -269,15 +270,15 @@ def _curves(found: Story) -> list[tuple[str, tuple[Curves, Curves], bool]]:
         ]
         return [*pale, *((f"resolved, {name}", v, style) for name, v, style in three(found.resolved, part))]
 
+    def weights(part: int) -> Curves:
+        eigen: Any = np.linalg.eigvalsh(found.metric[:, part : part + 3, part : part + 3])
+        broad: Any = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
+        pale: Curves = [("eigenvalues" if k == 0 else "_", eigen[:, k], broad) for k in range(3)]
+        return pale + three(diagonal, part)
+
     rows = [("f and resolved", (wanted(0), wanted(3)), True)]
     if found.has_metric:
-        eigen = [np.linalg.eigvalsh(found.metric[:, p, p]) for p in (slice(0, 3), slice(3, 6))]
-        light = {"color": _GREY, "lw": 2.5, "alpha": 0.35}
-        metric = tuple(
-            [("eigenvalues" if k == 0 else "_", e[:, k], light) for k in range(3)] + three(diagonal, part)
-            for e, part in zip(eigen, (0, 3), strict=True)
-        )
-        rows.append(("A, diagonal", (metric[0], metric[1]), False))
+        rows.append(("A, diagonal", (weights(0), weights(3)), False))
         rows.append(("share of the policy", (three(found.share, 0), three(found.share, 3)), False))
     seen = np.where(found.valid, 1.0, np.nan)
     views = (("front", _COLOURS[0]), ("side", _COLOURS[2]))
@@ -310,7 +311,8 @@ def _curve(axes: Any, found: Story, row: tuple[str, tuple[Curves, Curves], bool]
     counted = np.concatenate([v[found.sealing] for _, v, _ in curves])
     counted = counted[np.isfinite(counted)]
     if limit and len(counted):
-        reach = max(1.4 * float(np.abs(counted).max()), 1e-6)
+        least = (_LEAST_FEATURES if label == "features" else _LEAST)[half]
+        reach = max(1.4 * float(np.abs(counted).max()), least)
         axes.set_ylim(-reach, reach)
     else:
         axes.set_ylim(-0.05, max(1.35, 1.35 * float(np.max(counted, initial=0.0))))
