@@ -161,10 +161,10 @@ class Feed:
         self._depth = self._late + 2
         self._rngs: list[tuple[np.random.Generator, np.random.Generator] | None] = [None] * n
         self._frame = np.full(n, -1)
-        self._fresh = np.zeros(n, np.bool_)
         self._lost = np.zeros(n, np.bool_)
         self._shown = np.zeros(n, np.int64)
         self._kept: dict[str, list[NDArray[Any]]] = {}
+        self._taken: dict[str, NDArray[np.int64]] = {}
 
     def reset(self, i: int, dropout: np.random.Generator, latency: np.random.Generator) -> None:
         """Forgets one simulation's frames.
@@ -176,6 +176,8 @@ class Feed:
         """
         self._rngs[i] = dropout, latency
         self._frame[i], self._lost[i], self._shown[i] = -1, False, 0
+        for taken in self._taken.values():
+            taken[i] = -1
 
     def expose(self, frame: NDArray[np.int64]) -> None:
         """Decides the fate of a frame, once for each.
@@ -183,8 +185,7 @@ class Feed:
         Args:
             frame: Number of the frame in its episode, shape (N,).
         """
-        self._fresh = frame != self._frame
-        for i in map(int, np.flatnonzero(self._fresh)):
+        for i in map(int, np.flatnonzero(frame != self._frame)):
             rngs, k = self._rngs[i], int(frame[i])
             assert rngs is not None, "every row is reset before it looks"
             fate, jitter = rngs[0].random(), rngs[1].random()
@@ -205,7 +206,9 @@ class Feed:
         """
         if what not in self._kept:
             self._kept[what] = [np.zeros((self._depth, *x.shape), x.dtype) for x in new]
-        rows = np.flatnonzero(self._fresh)
+            self._taken[what] = np.full(len(self._frame), -1)
+        rows = np.flatnonzero(self._frame != self._taken[what])
+        self._taken[what] = self._frame
         slot, before = self._frame[rows] % self._depth, (self._frame[rows] - 1) % self._depth
         out = []
         for kept, x in zip(self._kept[what], new, strict=True):

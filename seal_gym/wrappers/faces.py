@@ -24,18 +24,20 @@ class DisturbanceWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
 
     kind: ClassVar[type[DisturbanceCfg]]
 
-    def __new__(cls, env: Any, severity: float = 1.0, **kwargs: Any) -> Any:
+    def __new__(cls, env: Any = None, severity: float = 1.0, **kwargs: Any) -> Any:
         """Makes the wrapper, or disturbs a vector.
 
         Args:
-            env: A sealing environment, single or vector.
+            env: A sealing environment, single or vector; None where a wrapper is unpickled.
             severity: 0 is off, 1 the default.
             **kwargs: Further attributes of the configuration.
 
         Returns:
             The wrapper, or the vector.
         """
-        if not hasattr(env, "num_envs"):
+        # Gymnasium's vectors were environments until 1.0; Stable-Baselines3's never are.
+        single = isinstance(env, gym.Env) and not isinstance(env, gym.vector.VectorEnv)
+        if env is None or single:
             return super().__new__(cls)
         _disturb(env, cls.kind.of(severity=severity, **kwargs))
         return env
