@@ -86,6 +86,7 @@ class ArmBatch:
         self.qd: Array = self._batch.bind("qvel")
         self._mocap_pos: Array = self._batch.bind("mocap_pos")
         self._mocap_quat: Array = self._batch.bind("mocap_quat")
+        self._force: Array = self._batch.bind("xfrc_applied")
         self.q_command = np.zeros((n, 6))
         self.qd_command = np.zeros((n, 6))
         self.part_pose = np.tile(np.eye(4), (n, 1, 1))
@@ -179,7 +180,8 @@ class ArmBatch:
         return np.concatenate((target, *(x.reshape(n, steps, -1) for x in (force, position, quat))), axis=2)
 
     def _arrive(self, outside: Outside) -> None:
-        """Puts part and obstacle where they are at the frame's end, as the arm already is."""
+        """Puts part and obstacle where they are at the frame's end, as the arm already is; nothing pushes."""
+        self._force[:] = 0.0
         if outside.part is not None and outside.part_pose is not None:
             self._mocap_pos[:, 0], self._mocap_quat[:, 0] = (x[:, -1] for x in outside.part)
             self.part_pose[:] = outside.part_pose

@@ -208,7 +208,7 @@ class Feed:
             self._kept[what] = [np.zeros((self._depth, *x.shape), x.dtype) for x in new]
             self._taken[what] = np.full(len(self._frame), -1)
         rows = np.flatnonzero(self._frame != self._taken[what])
-        self._taken[what] = self._frame
+        self._taken[what] = self._frame.copy()
         slot, before = self._frame[rows] % self._depth, (self._frame[rows] - 1) % self._depth
         out = []
         for kept, x in zip(self._kept[what], new, strict=True):

@@ -18,7 +18,7 @@ _ABOVE_WALL_M = 5e-3
 _WAY_M = 0.25
 _RAMP_S = 0.3
 # A gun at nominal speed comes to the crossing that long after the fist has come to rest.
-_BEFORE_S = 1.0
+_BEFORE_S = 3.0
 # Where along the seam the crossing may be.
 _SHARE = (0.35, 0.70)
 
@@ -28,7 +28,7 @@ class MovingObstacleCfg(DisturbanceCfg):
     """A ball of the size of a fist that the gun must let pass: who drives on as planned touches it.
 
     It waits beyond the wall and sets out when the gun, by its progress along the seam, is so far from the
-    crossing that at nominal speed it would come there one second after the fist. It crosses the seam's plane
+    crossing that at nominal speed it would come there three seconds after the fist. It crosses the seam's plane
     horizontally above the wall and stops where the gun's front camera would be. It collides with gun and arm,
     hides what it stands in front of, and its pose stands in ``info["obstacle"]`` and in
     ``ArmState.obstacle`` for leaves. Severity scales the time it stays.

@@ -74,7 +74,7 @@ def test_pushes_come_in_all_directions():
     peaks = []
     for seed in range(40):
         pushes.reset(0, np.random.default_rng(seed))
-        peaks.append(pushes._peak[0])
+        peaks.append(pushes._peak[0].copy())
     unit = np.concatenate(peaks) / 10.0
     np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=1e-12)
     assert np.abs(unit.mean(axis=0)).max() < 0.05

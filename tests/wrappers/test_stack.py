@@ -175,7 +175,7 @@ def test_leaves_and_the_picture_stay_when_a_disturbance_comes(make):
         calls.append(state.obstacle)
         n = len(state.q)
         eye = np.broadcast_to(np.eye(6), (n, 6, 6))
-        return Leaf(np.zeros((n, 6)), eye, np.zeros((n, 6)), np.zeros((n, 6, 6)))
+        return Leaf(eye, np.zeros((n, 6)), np.zeros((n, 6)), np.zeros((n, 6, 6)))
 
     env.unwrapped.add_leaf(leaf)
     env = w.MovingObstacle(env)
