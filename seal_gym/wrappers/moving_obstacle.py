@@ -28,9 +28,9 @@ class MovingObstacleCfg(DisturbanceCfg):
     """A ball of the size of a fist that the gun must let pass: who drives on as planned touches it.
 
     It waits beyond the wall and sets out when the gun, by its progress along the seam, is so far from the
-    crossing that at nominal speed it would come there three seconds after the fist. It crosses the seam's plane
-    horizontally above the wall and stops where the gun's front camera would be. It collides with gun and arm,
-    hides what it stands in front of, and its pose stands in ``info["obstacle"]`` and in
+    crossing that at nominal speed it would come there three seconds after the fist. It crosses the seam's
+    plane horizontally above the wall and stops where the gun's front camera would be. It collides with gun
+    and arm, hides what it stands in front of, and its pose stands in ``info["obstacle"]`` and in
     ``ArmState.obstacle`` for leaves. Severity scales the time it stays.
 
     Attributes:
