@@ -280,3 +280,16 @@ def test_forking_takes_nothing_from_the_generator():
 
 def test_a_base_configuration_has_nothing_to_check():
     assert DisturbanceCfg(severity=2).severity == 2
+
+
+@pytest.mark.skipif(not NEW, reason="needs gymnasium >= 1.0")
+def test_a_vectors_spec_knows_the_disturbances_it_was_wrapped_with():
+    venv = gym.make_vec("SealGym/Flat-v0", 2, perception="oracle", disturbances=["ExternalPush"])
+    venv = w.MovingWorkpiece(venv, severity=0.5)
+    told = json.loads(json.dumps(venv.spec.kwargs["disturbances"]))
+    again = gym.make_vec("SealGym/Flat-v0", 2, perception="oracle", disturbances=told)
+    assert again.unwrapped.core.cfg.disturbances == venv.unwrapped.core.cfg.disturbances
+    assert {d["name"]: d["severity"] for d in told} == {"ExternalPush": 1.0, "MovingWorkpiece": 0.5}
+    np.testing.assert_array_equal(venv.reset(seed=1)[0], again.reset(seed=1)[0])
+    for env in (venv, again):
+        env.close()
