@@ -198,6 +198,8 @@ class SealCore:
         self._tip_accel[i] = 0.0
         self._action[i] = 0.0
         self.frames[i] = 0
+        if self.obstacle is not None:
+            self.arm.place_obstacle(i, self.obstacle.position[i])
 
     def _hover(self, i: int, part_pose: Array, rng: np.random.Generator) -> Array:
         """Puts the gun in a hover where it touches nothing; gives ``T_part_tip``."""

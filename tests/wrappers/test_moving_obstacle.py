@@ -70,6 +70,8 @@ def test_who_drives_on_touches_it(make, env_id):
     env = make(env_id, control="rmp", disturbances=ONE)
     core, policy = env.unwrapped.core, RmpExpert(CELL)
     observation, info = env.reset(seed=500_000)
+    np.testing.assert_array_equal(info["obstacle"]["position_m"], core.arm.data(0).body("obstacle").xpos)
+    assert core.arm.data(0).ncon == 0
     done = False
     while not done:
         action, _ = policy.predict(observation)
