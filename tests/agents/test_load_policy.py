@@ -49,7 +49,8 @@ def test_a_wrong_name_lists_the_right_ones():
 @pytest.mark.parametrize("name", NEURAL)
 def test_without_weights_the_error_says_how_to_train(name, tmp_path, monkeypatch):
     monkeypatch.setattr(agents, "WEIGHTS", tmp_path)
-    kind, rounds = name.removesuffix("_dagger"), " --dagger 3" if name in DAGGER else ""
+    kind = name.removesuffix("_dagger")
+    rounds = " --dagger 3 --dagger-episodes 50 --dagger-epochs 6" if name in DAGGER else ""
     with pytest.raises(ConfigError, match=rf"agents\.train_bc --policy {kind} --seed 0{rounds} --data") as e:
         agents.load_policy(name)
     assert f"there as {name}.safetensors" in str(e.value)
