@@ -10,13 +10,10 @@ whatever the number of jobs, the batch or the engine.
 import argparse
 import fcntl
 import json
-import multiprocessing
-import multiprocessing.connection
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -27,7 +24,8 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from agents import demos, episodes, remote
-from agents.episodes import MAX_SEED, CollectCfg, Episode, Work
+from agents.episodes import FIRST_VALIDATION_SEED, CollectCfg, Episode, Work
+from agents.processes import pool
 from agents.provenance import ROOT, code_hash, commit, stack
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.envs.config import SealCfg
@@ -62,8 +60,9 @@ def plan(count: int, seed: int, cfg: CollectCfg) -> dict[str, Any]:
     """
     require(count >= 1, f"--episodes {count}: must be at least 1")
     require(
-        seed >= 0 and seed + count <= MAX_SEED,
-        f"--seed {seed} with --episodes {count}: training seeds are 0..{MAX_SEED - 1}; choose a lower seed",
+        seed >= 0 and seed + count <= FIRST_VALIDATION_SEED,
+        f"--seed {seed} with --episodes {count}: training seeds are 0..{FIRST_VALIDATION_SEED - 1}; choose a "
+        "lower seed",
     )
     wide = " --wide" if cfg == CollectCfg.wide() else ""
     config = {
@@ -107,20 +106,6 @@ def works(missing: list[int], batch: int, seed: int, cfg: CollectCfg) -> list[Wo
 # -- engines --------------------------------------------------------------------------------------------
 
 
-def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-    sentinel = parent.sentinel
-
-    def watch() -> None:
-        multiprocessing.connection.wait([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def run_locally(jobs: int) -> Engine:
     """Runs units in processes of this machine.
 
@@ -135,11 +120,9 @@ def run_locally(jobs: int) -> Engine:
         if jobs == 1:
             yield from map(episodes.run, units)
             return
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        context = multiprocessing.get_context("spawn")  # a forked process would share threads with this one
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent) as pool:
+        with pool(jobs) as workers:
             try:
-                for future in as_completed([pool.submit(episodes.run, w) for w in units]):
+                for future in as_completed([workers.submit(episodes.run, w) for w in units]):
                     yield future.result()
             except BrokenProcessPool:
                 raise SealGymError(
@@ -147,7 +130,7 @@ def run_locally(jobs: int) -> Engine:
                     "with fewer --jobs if need be; it goes on where it stopped"
                 ) from None
             finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+                workers.shutdown(wait=False, cancel_futures=True)
 
     return engine
 

@@ -11,20 +11,21 @@ from agents import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import sys  # noqa: E402
-from collections.abc import Callable  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import sys
+from pathlib import Path
+from typing import Any
 
-import gymnasium as gym  # noqa: E402
-import numpy as np  # noqa: E402
+import gymnasium as gym
+import numpy as np
 
-import agents  # noqa: E402
-import seal_gym  # noqa: E402
-from agents import Policy  # noqa: E402
-from seal_gym.core.errors import SealGymError  # noqa: E402
-from seal_gym.envs.config import PERCEPTIONS  # noqa: E402
+import agents
+import seal_gym
+from agents import Policy
+from agents.rollouts import play_once
+from agents.video import open_video
+from seal_gym.core.errors import SealGymError
+from seal_gym.envs.config import PERCEPTIONS
 
 VIDEO_EVERY = 5  # frames: at 30 pictures a second, five times real time
 
@@ -45,38 +46,8 @@ def find_policy(name: str) -> Policy:
     return agents.load_policy(str(folder / "policy.safetensors") if folder.is_dir() else name)
 
 
-def play(
-    policy: Policy,
-    env: Any,
-    seed: int,
-    watch: Callable[[Any], None] | None = None,
-) -> dict[str, Any]:
-    """Plays one episode.
-
-    Args:
-        policy: The policy.
-        env: With the policy's control mode.
-        seed: Of the episode.
-        watch: Called after the reset and after each step.
-
-    Returns:
-        ``episode_metrics``, with ``return`` (the sum of rewards) and ``seed``.
-    """
-    observation, info = env.reset(seed=seed)
-    state, start, total, done = None, np.array([True]), 0.0, False
-    if watch:
-        watch(env)
-    while not done:
-        action, state = policy.predict(observation, state=state, episode_start=start)
-        observation, reward, terminated, truncated, info = env.step(action)
-        total, start, done = total + float(reward), np.array([False]), terminated or truncated
-        if watch:
-            watch(env)
-    return {**info["episode_metrics"], "return": total, "seed": seed}
-
-
 class Film:
-    """Writes each fifth picture of an environment to an MP4 (H.264): ``watch`` for ``play``.
+    """Writes each fifth picture of an environment to an MP4 (H.264): called after each step.
 
     The file is opened with the first picture: where none can be made, there is none.
     """
@@ -105,12 +76,7 @@ class Film:
             return
         picture: Any = env.render()
         if self._writer is None:
-            import imageio.v2 as imageio
-
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = imageio.get_writer(
-                self._path, fps=30, codec="libx264", quality=7, macro_block_size=8, pixelformat="yuv420p"
-            )
+            self._writer = open_video(self._path)
         self._writer.append_data(picture)
 
     def close(self) -> None:
@@ -130,7 +96,7 @@ def film(policy: Policy, env_id: str, kwargs: dict[str, Any], seed: int, path: P
         path: The MP4 file.
 
     Returns:
-        As ``play``.
+        As ``play_once``.
 
     Raises:
         RenderError: If this machine cannot make pictures.
@@ -138,7 +104,7 @@ def film(policy: Policy, env_id: str, kwargs: dict[str, Any], seed: int, path: P
     env: Any = gym.make(env_id, render_mode="rgb_array", disable_env_checker=True, **kwargs)
     camera = Film(path)
     try:
-        return play(policy, env, seed, camera)
+        return play_once(policy, env, seed, lambda env, info: camera(env))
     finally:
         camera.close()
         env.close()
@@ -189,7 +155,7 @@ def line(row: dict[str, Any]) -> str:
     """An episode in one line.
 
     Args:
-        row: From ``play``.
+        row: From ``play_once``.
 
     Returns:
         Text.
@@ -222,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
             if options.video and not rows:
                 rows.append(film(policy, options.env, kwargs, seed, options.video))
             else:
-                rows.append(play(policy, env, seed))
+                rows.append(play_once(policy, env, seed))
             print(line(rows[-1]))
         env.close()
     except SealGymError as error:

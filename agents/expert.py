@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.reading import Reading, read, rows_of
 from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.frames import Array
-from seal_gym.envs.adapters import CHOLESKY_SCALE
+from seal_gym.envs.adapters import CHOLESKY_SCALE, tip_scale
 from seal_gym.rmp import SealingCfg, SeamErrors, blend, metric_to_cholesky, reference_twist, seam_policies
-
-_MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 
 
 class RmpExpert:
@@ -34,8 +33,7 @@ class RmpExpert:
         """
         self._cell = cell or load_cell()
         self._sealing = sealing or SealingCfg()
-        limits = self._cell.limits
-        self._scale = np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
+        self._scale = tip_scale(self._cell.limits)
 
     def predict(
         self,
@@ -56,23 +54,17 @@ class RmpExpert:
             Actions of shape (27,) or (N, 27), and the state.
         """
         del episode_start, deterministic
-        features = observation["features"] if isinstance(observation, dict) else observation
-        rows = np.atleast_2d(np.asarray(features, dtype=np.float64))
-        action = self._act(rows).astype(np.float32)
-        return (action if features.ndim == 2 else action[0]), state
+        rows, many = rows_of(observation)
+        action = self._act(read(rows)).astype(np.float32)
+        return (action if many else action[0]), state
 
-    def _act(self, o: Array) -> Array:
+    def _act(self, now: Reading) -> Array:
         # The features of a lost view are old: following them would drive the gun on.
-        seen = np.where(o[:, 2] * o[:, 5] > 0.5, 1.0, 0.0)
-        distance, angle = _MM * seen, _DEG * seen
-        errors = SeamErrors(
-            distance * o[:, 0], angle * o[:, 1], distance * o[:, 3], angle * o[:, 4], _DEG * o[:, 10]
-        )
-        twist = np.concatenate((_MM * o[:, 11:14], _DEG * o[:, 14:17]), axis=1)
-        seam = np.zeros_like(twist)
-        seam[:, [0, 2]], seam[:, [3, 5]] = _MM * o[:, 6:8], _DEG * o[:, 8:10]
-        speed = seen * self._cell.process.speed_m_s
-        policy = blend(seam_policies(errors, twist, reference_twist(speed, seam), self._sealing))
+        seen = np.where(now.seen, 1.0, 0.0)
+        d_front, theta_front, d_side, theta_side, lean = now.errors
+        errors = SeamErrors(seen * d_front, seen * theta_front, seen * d_side, seen * theta_side, lean)
+        reference = reference_twist(seen * self._cell.process.speed_m_s, now.seam_twist)
+        policy = blend(seam_policies(errors, now.twist, reference, self._sealing))
         action = np.concatenate(
             (policy.accel / self._scale, metric_to_cholesky(policy.metric) / CHOLESKY_SCALE), axis=1
         )

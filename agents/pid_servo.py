@@ -47,23 +47,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.episodes import FIRST_VALIDATION_SEED
+from agents.reading import Reading, read, rows_of
 from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.errors import is_number, require
 from seal_gym.core.frames import Array
-from seal_gym.envs.core import FEATURES
+from seal_gym.envs.adapters import tip_scale
 from seal_gym.rmp import (
     SealingCfg,
-    SeamErrors,
     axis_errors,
     blend,
     fixed_policies,
     reference_twist,
 )
 
-_MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 X, Y, Z, ABOUT_X, ABOUT_Y, ABOUT_Z = range(6)
 AXES = (X, Z, ABOUT_X, ABOUT_Z)  # that the loops act on, in the order of ``PidServoCfg``
-FIRST_SEED = 500_000  # protocol.md: tuning from here on, tables from 1,000,000
 PARTS = ("flat", "cylinder")
 _ALIKE = 1.03  # RMSEs within this factor of the best are as good
 _FIRST_ARC_M = 0.010  # where protocol.md begins to count errors
@@ -160,8 +159,7 @@ class PidServo:
         """
         self._cell = cell or load_cell()
         self._cfg = cfg or PidServoCfg()
-        limits = self._cell.limits
-        self._scale = np.repeat((limits.linear_m_s2, limits.angular_rad_s2), 3)
+        self._scale = tip_scale(self._cell.limits)
         kp, ki, kd, bound = (np.array([getattr(x, f.name) for x in self._cfg.loops]) for f in fields(LoopCfg))
         self._kp, self._ki, self._kd, self._bound = kp, ki, kd, bound
 
@@ -186,36 +184,26 @@ class PidServo:
             before a row has seen anything, shape (N, 4), m/s and rad/s.
         """
         del deterministic
-        features = observation["features"] if isinstance(observation, dict) else observation
-        rows = np.atleast_2d(np.asarray(features, dtype=np.float64))
-        require(
-            rows.ndim == 2 and rows.shape[1] == FEATURES,
-            f"observation has shape {np.shape(features)}: must be ({FEATURES},) or (N, {FEATURES})",
-        )
-        action, after = self._act(rows, _integrals(state, episode_start, len(rows)))
-        return (action if np.ndim(features) == 2 else action[0]), after
+        rows, many = rows_of(observation)
+        action, after = self._act(read(rows), _integrals(state, episode_start, len(rows)))
+        return (action if many else action[0]), after
 
-    def _act(self, o: Array, integral: Array) -> tuple[NDArray[np.float32], Array]:
-        seen = (o[:, 2] > 0.5) & (o[:, 5] > 0.5)
-        errors = SeamErrors(_MM * o[:, 0], _DEG * o[:, 1], _MM * o[:, 3], _DEG * o[:, 4], _DEG * o[:, 10])
-        twist = np.concatenate((_MM * o[:, 11:14], _DEG * o[:, 14:17]), axis=1)
-        velocity, integral = self._loops(errors, twist, _seam_twist(o), integral, seen)
-        wanted = np.zeros_like(twist)
+    def _act(self, now: Reading, integral: Array) -> tuple[NDArray[np.float32], Array]:
+        velocity, integral = self._loops(now, integral)
+        wanted = np.zeros_like(now.twist)
         wanted[:, AXES] = velocity
-        wanted[:, Y] = np.where(seen, self._cell.process.speed_m_s, 0.0)
-        accel = self._cfg.speed_s * (wanted - twist)
-        accel[:, ABOUT_Y] = self._lean(errors, twist, o[:, 17:23])
+        wanted[:, Y] = np.where(now.seen, self._cell.process.speed_m_s, 0.0)
+        accel = self._cfg.speed_s * (wanted - now.twist)
+        accel[:, ABOUT_Y] = self._lean(now)
         return np.clip(accel / self._scale, -1.0, 1.0).astype(np.float32), integral
 
-    def _loops(
-        self, errors: SeamErrors, twist: Array, seam: Array, integral: Array, seen: NDArray[np.bool_]
-    ) -> tuple[Array, Array]:
+    def _loops(self, now: Reading, integral: Array) -> tuple[Array, Array]:
         """Velocities on ``AXES`` and the integral terms after the frame, shape (N, 4) each."""
-        error = axis_errors(errors)[:, AXES]
-        rate = (seam - twist)[:, AXES]
+        error = axis_errors(now.errors)[:, AXES]
+        rate = (now.seam_twist - now.twist)[:, AXES]
         # Travelling at an angle to the seam moves it sideways in the view.
-        rate[:, 0] += twist[:, Y] * np.sin(errors.theta_front)
-        rate[:, 1] += twist[:, Y] * np.sin(errors.theta_side)
+        rate[:, 0] += now.twist[:, Y] * np.sin(now.errors.theta_front)
+        rate[:, 1] += now.twist[:, Y] * np.sin(now.errors.theta_side)
         preload = -self._ki / self._kp * error
         begun = np.where(np.isnan(integral), preload, integral)
         grown = begun + self._ki * self._cell.timing.frame_s * error
@@ -223,20 +211,14 @@ class PidServo:
         bounded = np.abs(asked) > self._bound
         velocity = np.clip(asked, -self._bound, self._bound)
         after = np.where(bounded, preload, grown)
-        return np.where(seen[:, None], velocity, 0.0), np.where(seen[:, None], after, integral)
+        seen = now.seen[:, None]
+        return np.where(seen, velocity, 0.0), np.where(seen, after, integral)
 
-    def _lean(self, errors: SeamErrors, twist: Array, last_accel: Array) -> Array:
+    def _lean(self, now: Reading) -> Array:
         """What the expert's fixed leaves make of the lean, shape (N,), rad/s^2."""
-        at_rest = reference_twist(0.0, np.zeros_like(twist))
-        fixed = fixed_policies(errors, twist, at_rest, last_accel, self._cfg.sealing)
+        at_rest = reference_twist(0.0, np.zeros_like(now.twist))
+        fixed = fixed_policies(now.errors, now.twist, at_rest, now.tip_accel, self._cfg.sealing)
         return blend(fixed).accel[:, ABOUT_Y]
-
-
-def _seam_twist(o: Array) -> Array:
-    """The estimated twist of the seam, shape (N, 6), m/s and rad/s."""
-    seam = np.zeros((len(o), 6))
-    seam[:, [X, Z]], seam[:, [ABOUT_X, ABOUT_Z]] = _MM * o[:, 6:8], _DEG * o[:, 8:10]
-    return seam
 
 
 def _integrals(state: Array | None, episode_start: NDArray[np.bool_] | None, n: int) -> Array:
@@ -334,7 +316,7 @@ class Judge:
         """Builds the environments.
 
         Args:
-            trials: On each part, from ``FIRST_SEED`` on.
+            trials: On each part, from ``FIRST_VALIDATION_SEED`` on.
             seconds: Of a run, at most.
             perception: Of the environments.
         """
@@ -358,7 +340,9 @@ class Judge:
         """
         if cfg not in self.known:
             policy = PidServo(cfg=cfg)
-            runs = [r for venv in self._venvs for r in run(policy, venv, FIRST_SEED, self._seconds)]
+            runs = [
+                r for venv in self._venvs for r in run(policy, venv, FIRST_VALIDATION_SEED, self._seconds)
+            ]
             rmse = [value for failed, value in runs if not failed]
             self.known[cfg] = (len(runs) - len(rmse), float(np.mean(rmse)) if rmse else np.inf)
         return self.known[cfg]

@@ -43,6 +43,7 @@ from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 from torch import Tensor, nn
 
+from agents.reading import Reading, read, rows_of
 from seal_gym.core.cell import CellCfg, load_cell
 from seal_gym.core.errors import ConfigError, SealGymError, is_number, require
 from seal_gym.core.frames import Array
@@ -57,7 +58,7 @@ CONTROL_OF = {"neural_rmp": "rmp", "neural_rmp_identity": "rmp", "neural_control
 KINDS = tuple(CONTROL_OF)
 FORMAT, VERSION = "seal_gym policy", 1
 
-_MM, _DEG = 1e-3, float(np.deg2rad(1.0))
+_MM = 1e-3
 _DISTANCE_MM, _ANGLE_DEG = 2.0, 5.0  # about the errors at which the expert's springs saturate
 _SPEED_MM_S, _TURN_DEG_S = 10.0, 20.0
 # Smallest diagonal entry of the Cholesky factor, as an action: a metric of 4e-4 beside the expert's 0.5 to 1,
@@ -315,42 +316,34 @@ class LearnedPolicy:
             Actions of shape (k,) or (N, k) in [-1, 1], and the state.
         """
         del episode_start, deterministic
-        features = observation["features"] if isinstance(observation, dict) else observation
-        rows = np.atleast_2d(np.asarray(features, dtype=np.float32))
-        require(
-            rows.ndim == 2 and rows.shape[1] == FEATURES,
-            f"observation has shape {np.shape(features)}: must be ({FEATURES},) or (N, {FEATURES})",
-        )
+        rows, many = rows_of(observation)
         action = self._act(rows)
-        return (action if np.ndim(features) == 2 else action[0]), state
+        return (action if many else action[0]), state
 
     def _act(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
         # Row by row: a product over all rows may round otherwise than one over a single row.
         with torch.inference_mode(), _one_thread():
             out = [self.net(torch.from_numpy(row[None])).numpy() for row in rows]
         action = np.concatenate(out)
-        lost = (rows[:, 2] < 0.5) | (rows[:, 5] < 0.5)
+        lost = ~read(rows).seen
         if lost.any():
-            action[lost] = _brake(rows[lost].astype(np.float64), self.cfg)
+            action[lost] = _brake(read(rows[lost]), self.cfg)
         return np.asarray(np.minimum(np.maximum(action, -1.0), 1.0), dtype=np.float32)
 
 
-def _brake(o: Array, cfg: PolicyCfg) -> Array:
+def _brake(now: Reading, cfg: PolicyCfg) -> Array:
     """Brings the tip to rest against the seam; needs no feature of a view.
 
     With ``control="rmp"`` the fixed damping leaf goes on pulling towards the nominal speed: that pull is
     taken off, weighted as the leaf's metric and the policy's.
     """
-    twist, seam = o[:, 11:17].copy(), np.zeros((len(o), ACCELS))
-    seam[:, [0, 2, 3, 5]] = o[:, 6:10]
-    unit = np.array([_MM] * 3 + [_DEG] * 3)
-    accel = -_BRAKE_S * unit * (twist - seam)
+    accel = -_BRAKE_S * (now.twist - now.seam_twist)
     if cfg.control == "tip":
         return accel / cfg.scale
     diagonal = 1.0 if cfg.kind == "neural_rmp" else _UNIT_METRIC
     damping = DampingCfg()
     accel[:, 1] -= damping.weight * damping.damping_s * cfg.speed_m_s / (CHOLESKY_SCALE * diagonal) ** 2
-    entries = np.zeros((len(o), CHOLESKY))
+    entries = np.zeros((len(accel), CHOLESKY))
     entries[:, _DIAGONAL] = diagonal
     return np.concatenate((accel / cfg.scale, entries), axis=1)
 

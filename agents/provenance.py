@@ -1,13 +1,13 @@
 """Where data come from: code, packages, commit."""
 
-import hashlib
 import subprocess
-import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from seal_gym.core.provenance import digest, versions
 
 ROOT = Path(__file__).resolve().parents[1]
 _PACKAGES = (
+    "python",
     "seal-gym",
     "gymnasium",
     "mujoco",
@@ -25,31 +25,23 @@ def code_hash() -> str:
     Returns:
         16 hexadecimal digits.
     """
-    digest = hashlib.sha256()
     files = [
         f
         for d in ("seal_gym", "assets")
         for f in (ROOT / d).rglob("*")
         if f.suffix in (".py", ".xml", ".toml")
     ]
-    for file in sorted([*files, ROOT / "agents" / "expert.py", ROOT / "agents" / "episodes.py"]):
-        digest.update(str(file.relative_to(ROOT)).encode() + b"\0" + file.read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+    files += [ROOT / "agents" / "expert.py", ROOT / "agents" / "episodes.py"]
+    return digest({str(f.relative_to(ROOT)): f for f in files})
 
 
 def stack() -> dict[str, str]:
     """Versions of the packages that decide the data.
 
     Returns:
-        Version by package.
+        Version by package, of those installed.
     """
-    found = {"python": sys.version.split()[0]}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue  # a checkout that is not installed
-    return found
+    return versions(_PACKAGES)
 
 
 def commit() -> str | None:

@@ -1,19 +1,19 @@
 """Episodes driven by a policy and labelled by the expert, and closed-loop scores; N environments at once."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.episodes import tip_acceleration, tip_action, tip_scale
+from agents.episodes import FIRST_VALIDATION_SEED, tip_acceleration, tip_action
 from agents.expert import RmpExpert
 from seal_gym.core.errors import require
-from seal_gym.envs.adapters import RmpAdapter
+from seal_gym.envs.adapters import RmpAdapter, tip_scale
 from seal_gym.envs.core import SealCore
 from seal_gym.envs.sb3 import SealSb3VecEnv
 
 FloatRows = NDArray[np.float32]
-FIRST_VALIDATION_SEED = 500_000  # protocol.md: training below, tables from 1,000,000
 _AT_ONCE = 32
 
 
@@ -42,7 +42,7 @@ class Labeller:
         """
         cell = core.cfg.cell
         self._core, self._expert, self._adapter = core, RmpExpert(cell), RmpAdapter(cell)
-        self._scale = tip_scale(cell)
+        self._scale = tip_scale(cell.limits)
 
     def __call__(self, observation: FloatRows) -> tuple[FloatRows, FloatRows]:
         """Labels one frame.
@@ -122,6 +122,58 @@ def _roll_at_once(
     return [Episode(*(rows[: lengths[i], i].copy() for rows in stacked)) for i in range(n)]
 
 
+def play_once(
+    policy: Any, env: Any, seed: int, watch: Callable[[Any, dict[str, Any]], None] | None = None
+) -> dict[str, Any]:
+    """One episode in a single environment.
+
+    Args:
+        policy: With SB3's ``predict``.
+        env: With the policy's control mode.
+        seed: Of the episode.
+        watch: Called with the environment and the info after the reset and after each step.
+
+    Returns:
+        ``episode_metrics``, with ``return`` (the sum of rewards) and ``seed``.
+    """
+    observation, info = env.reset(seed=seed)
+    state, start, total, done = None, np.array([True]), 0.0, False
+    if watch:
+        watch(env, info)
+    while not done:
+        action, state = policy.predict(observation, state=state, episode_start=start)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, start, done = total + float(reward), np.array([False]), terminated or truncated
+        if watch:
+            watch(env, info)
+    return {**info["episode_metrics"], "return": total, "seed": seed}
+
+
+def play(policy: Any, venv: SealSb3VecEnv, seed: int) -> list[dict[str, Any]]:
+    """One episode in each environment.
+
+    Args:
+        policy: With SB3's ``predict``.
+        venv: The environments.
+        seed: Of the first; the next have the next.
+
+    Returns:
+        ``episode_metrics`` of each, with ``return`` (the sum of rewards) and ``seed``.
+    """
+    venv.seed(seed)
+    observation, state = venv.reset(), None
+    start = np.ones(venv.num_envs, np.bool_)
+    rows: list[dict[str, Any] | None] = [None] * venv.num_envs
+    while None in rows:
+        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
+        observation, _, start, infos = venv.step(action)
+        for i in map(int, np.flatnonzero(start)):
+            if rows[i] is None:
+                info = infos[i]
+                rows[i] = {**info["episode_metrics"], "return": info["episode"]["r"], "seed": seed + i}
+    return [row for row in rows if row is not None]
+
+
 def score(
     policy: Any,
     *,
@@ -146,9 +198,10 @@ def score(
     """
     metrics: list[dict[str, Any]] = []
     for first in range(seed, seed + trials, _AT_ONCE):
-        metrics += _episode_metrics(
-            policy, workpiece, first, min(_AT_ONCE, seed + trials - first), perception, **kwargs
-        )
+        n = min(_AT_ONCE, seed + trials - first)
+        venv = _vec(policy.control, workpiece, n, perception, **kwargs)
+        metrics += play(policy, venv, first)
+        venv.close()
     reached = [m["rmse_mm"] for m in metrics if m["reached"]]
     return {
         "trials": trials,
@@ -157,20 +210,3 @@ def score(
         "timeout": sum(m["timeout"] for m in metrics),
         "rmse_mm": float(np.mean(reached)) if reached else None,
     }
-
-
-def _episode_metrics(
-    policy: Any, workpiece: str, seed: int, n: int, perception: str, **kwargs: Any
-) -> list[dict[str, Any]]:
-    venv = _vec(policy.control, workpiece, n, perception, **kwargs)
-    venv.seed(seed)
-    observation: Any = venv.reset()
-    ended: dict[int, dict[str, Any]] = {}
-    state, start = None, np.ones(n, np.bool_)
-    while len(ended) < n:
-        action, state = policy.predict(observation, state=state, episode_start=start)
-        observation, _, start, infos = venv.step(action)
-        for i in map(int, np.flatnonzero(start)):
-            ended.setdefault(i, infos[i]["episode_metrics"])
-    venv.close()
-    return [ended[i] for i in range(n)]

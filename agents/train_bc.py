@@ -41,8 +41,6 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, cast
 
@@ -59,7 +57,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents import rollouts
+from agents import demos, rollouts
 from agents.policies import (
     ACCELS,
     CONTROL_OF,
@@ -73,12 +71,14 @@ from agents.policies import (
 )
 from agents.rollouts import Episode
 from seal_gym.core.errors import ConfigError, is_number, require
+from seal_gym.core.provenance import versions
 from seal_gym.envs.core import FEATURES
 
 FloatRows = NDArray[np.float32]
 _SPLIT_SEED = 0  # one split for every kind and training seed
 _HELD_OUT = 10
 _STATE = "state"
+_STACK = ("python", "torch", "safetensors", "imitation", "stable-baselines3", "gymnasium", "mujoco", "numpy")
 _PARTS = ("flat", "cylinder")  # to train and to choose on: the rectangular part stays unseen
 _DAGGER_SEED = 300_000  # away from the demonstrations', below the validation seeds
 _DAGGER_RUNS, _DAGGER_STRIDE = 20, 10_000
@@ -560,20 +560,9 @@ def read_episodes(path: Path) -> list[Episode]:
     Returns:
         One entry an episode.
     """
-    data = import_module("agents.demos").load(path)
+    data = demos.load(path)
     rows = (data.observations, data.actions("tip"), data.actions("rmp"))
     return [Episode(*(r[start:stop] for r in rows)) for start, stop in data.episodes]
-
-
-def _stack() -> dict[str, str | None]:
-    def installed(name: str) -> str | None:
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            return None
-
-    names = ("torch", "safetensors", "imitation", "stable-baselines3", "gymnasium", "mujoco", "numpy")
-    return {"python": sys.version.split()[0], **{name: installed(name) for name in names}}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -647,7 +636,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "train": asdict(cfg),
         "dagger": asdict(dagger),
         "data": options.data.name,
-        "stack": _stack(),
+        "stack": versions(_STACK),
     }
     path = options.out / f"{cfg.kind}-seed{cfg.seed}.safetensors"
     save(policy, path, card)

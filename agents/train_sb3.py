@@ -13,40 +13,41 @@ from agents import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import contextlib  # noqa: E402
-import json  # noqa: E402
-import shlex  # noqa: E402
-import sys  # noqa: E402
-import time  # noqa: E402
-from collections.abc import Iterator  # noqa: E402
-from dataclasses import asdict, dataclass, field, replace  # noqa: E402
-from importlib.metadata import version  # noqa: E402
-from importlib.util import find_spec  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import contextlib
+import json
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-from safetensors import SafetensorError, safe_open  # noqa: E402
-from safetensors.torch import save as save_tensors  # noqa: E402
-from stable_baselines3 import PPO, SAC  # noqa: E402
-from stable_baselines3.common.base_class import BaseAlgorithm  # noqa: E402
-from stable_baselines3.common.buffers import ReplayBuffer  # noqa: E402
-from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
-from stable_baselines3.common.logger import Logger, configure  # noqa: E402
-from stable_baselines3.common.utils import set_random_seed  # noqa: E402
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper  # noqa: E402
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn  # noqa: E402
-from stable_baselines3.sac.policies import SACPolicy  # noqa: E402
-from torch import Tensor  # noqa: E402
-from tqdm import tqdm  # noqa: E402
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as save_tensors
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.sac.policies import SACPolicy
+from torch import Tensor
+from tqdm import tqdm
 
-import seal_gym  # noqa: E402
-from agents import policies, sb3_policies  # noqa: E402
-from agents.policies import LearnedPolicy, PolicyFileError, write_whole  # noqa: E402
-from agents.sb3_policies import (  # noqa: E402
+import seal_gym
+from agents import policies, sb3_policies
+from agents.episodes import FIRST_VALIDATION_SEED
+from agents.policies import LearnedPolicy, PolicyFileError, write_whole
+from agents.rollouts import play
+from agents.sb3_policies import (
     ALGORITHMS,
     GaussianActorCritic,
     NetCfg,
@@ -54,13 +55,13 @@ from agents.sb3_policies import (  # noqa: E402
     put_actor,
     read_tensors,
 )
-from seal_gym.core.errors import RenderError, SealGymError, require  # noqa: E402
-from seal_gym.envs.config import PERCEPTIONS  # noqa: E402
-from seal_gym.envs.sb3 import SealSb3VecEnv, make_sb3_vec  # noqa: E402
-from seal_gym.tasks.progress import SealTaskCfg  # noqa: E402
-from seal_gym.tasks.reward import RewardCfg  # noqa: E402
+from seal_gym.core.errors import RenderError, SealGymError, require
+from seal_gym.core.provenance import versions
+from seal_gym.envs.config import PERCEPTIONS
+from seal_gym.envs.sb3 import make_sb3_vec
+from seal_gym.tasks.progress import SealTaskCfg
+from seal_gym.tasks.reward import RewardCfg
 
-VALIDATION_SEED = 500_000  # training below, published tables above (the protocol's ranges)
 _STACK = ("stable-baselines3", "gymnasium", "torch", "numpy", "mujoco")
 _LOG_STD_FINE = -3.5  # spread around a policy that can seal already
 
@@ -164,8 +165,8 @@ class TrainCfg:
                 f"{name} = {value!r}: must be a whole number >= {least}",
             )
         require(
-            self.seed < VALIDATION_SEED,
-            f"seed = {self.seed}: from {VALIDATION_SEED} on seeds are for validation and tables",
+            self.seed < FIRST_VALIDATION_SEED,
+            f"seed = {self.seed}: from {FIRST_VALIDATION_SEED} on seeds are for validation and tables",
         )
         require(
             1 <= self.n_envs <= self.ppo.rollout and self.ppo.rollout % self.ppo.n_envs == 0,
@@ -195,31 +196,6 @@ class TrainCfg:
 
 
 # -- evaluation -----------------------------------------------------------------------------------------
-
-
-def play(policy: Any, venv: SealSb3VecEnv, seed: int) -> list[dict[str, Any]]:
-    """One episode in each environment.
-
-    Args:
-        policy: With SB3's ``predict``.
-        venv: The environments.
-        seed: Of the first; the next have the next.
-
-    Returns:
-        ``episode_metrics`` of each, with ``return`` (the sum of rewards) and ``seed``.
-    """
-    venv.seed(seed)
-    observation, state = venv.reset(), None
-    start = np.ones(venv.num_envs, np.bool_)
-    rows: list[dict[str, Any] | None] = [None] * venv.num_envs
-    while None in rows:
-        action, state = policy.predict(observation, state=state, episode_start=start, deterministic=True)
-        observation, _, start, infos = venv.step(action)
-        for i in map(int, np.flatnonzero(start)):
-            if rows[i] is None:
-                info = infos[i]
-                rows[i] = {**info["episode_metrics"], "return": info["episode"]["r"], "seed": seed + i}
-    return [row for row in rows if row is not None]
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -520,7 +496,7 @@ class Bar(BaseCallback):
 
 def _seed_round(model: BaseAlgorithm, cfg: TrainCfg, number: int) -> None:
     """Makes a round depend on seed and number only, not on what the process did before."""
-    drawn = np.random.default_rng((cfg.seed, number)).integers(0, VALIDATION_SEED - cfg.n_envs, 2)
+    drawn = np.random.default_rng((cfg.seed, number)).integers(0, FIRST_VALIDATION_SEED - cfg.n_envs, 2)
     set_random_seed(int(drawn[0]))
     env = model.get_env()
     assert env is not None
@@ -597,7 +573,7 @@ class Run:
                 learned_s = time.perf_counter() - started
                 row = {
                     "step": model.num_timesteps,
-                    **summary(play(self._policy(model), venv, VALIDATION_SEED)),
+                    **summary(play(self._policy(model), venv, FIRST_VALIDATION_SEED)),
                 }
                 row |= {"learn_s": round(learned_s, 1)}
                 self._keep(model, row, rows)
@@ -672,7 +648,7 @@ class Run:
         path = self.out / "videos" / f"{model.num_timesteps:09d}.mp4"
         kwargs = {"control": self.cfg.net.control, "perception": self.cfg.perception}
         try:
-            film(self._policy(model), self.cfg.env, kwargs, VALIDATION_SEED, path)
+            film(self._policy(model), self.cfg.env, kwargs, FIRST_VALIDATION_SEED, path)
         except RenderError as error:
             self.videos = False
             sys.stderr.write(f"no videos: {error}\n")
@@ -691,7 +667,7 @@ def about_run(cfg: TrainCfg) -> dict[str, Any]:
         "command": shlex.join(["python", "-m", "agents.train_sb3", *sys.argv[1:]]),
         "control": cfg.net.control,
         "training": cfg.comparable(),
-        "stack": {name: version(name) for name in _STACK},
+        "stack": versions(_STACK),
     }
 
 

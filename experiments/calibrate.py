@@ -10,39 +10,39 @@ from experiments import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import json  # noqa: E402
-import shlex  # noqa: E402
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any, NamedTuple  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import matplotlib as mpl  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
-from tqdm import tqdm  # noqa: E402
+import matplotlib as mpl
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
-import seal_gym  # noqa: E402
-from experiments import results  # noqa: E402
-from seal_gym.core.cell import CameraCfg, load_cell, with_cameras  # noqa: E402
-from seal_gym.core.errors import RenderError, SealGymError  # noqa: E402
-from seal_gym.core.frames import Array, transform, yaw_pose  # noqa: E402
-from seal_gym.core.paths import asset  # noqa: E402
-from seal_gym.planning import ik  # noqa: E402
-from seal_gym.sim.arm import ArmBatch  # noqa: E402
-from seal_gym.sim.markers import ShotCfg, shoot_board, shoot_marker  # noqa: E402
-from seal_gym.sim.reach import check_reach  # noqa: E402
-from seal_gym.sim.scene import GROUP_COLLISION, Scene, build_scene, cached_scene  # noqa: E402
-from seal_gym.tasks.progress import SealTaskCfg  # noqa: E402
-from seal_gym.vision.calibration import Board, BoardCorners, Calibration, SolveCfg, calibrate  # noqa: E402
-from seal_gym.vision.part_pose import PartMarker, level_part_pose, part_pose  # noqa: E402
-from seal_gym.workpieces import catalogue  # noqa: E402
+import seal_gym
+from experiments import command, results
+from seal_gym.core.cell import CameraCfg, load_cell, with_cameras
+from seal_gym.core.errors import RenderError, SealGymError
+from seal_gym.core.frames import Array, transform, yaw_pose
+from seal_gym.core.paths import asset
+from seal_gym.planning import ik
+from seal_gym.sim.arm import ArmBatch
+from seal_gym.sim.markers import ShotCfg, shoot_board, shoot_marker
+from seal_gym.sim.reach import check_reach
+from seal_gym.sim.scene import GROUP_COLLISION, Scene, build_scene, cached_scene
+from seal_gym.tasks.progress import SealTaskCfg
+from seal_gym.vision.calibration import Board, BoardCorners, Calibration, SolveCfg, calibrate
+from seal_gym.vision.part_pose import PartMarker, level_part_pose, part_pose
+from seal_gym.workpieces import catalogue
 
 mpl.use("Agg")  # no screen needed
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.patches import Polygon, Rectangle  # noqa: E402
+import matplotlib.pyplot as plt
+from matplotlib.patches import Polygon, Rectangle
 
 Grey = NDArray[np.uint8]
 # The board's middle, on a block as high as a part's plate; the board faces up, its x away from the robot.
@@ -95,13 +95,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--out", type=Path, default=Path("out/calibrate"), help="folder (default: %(default)s)"
     )
-    options = parser.parse_args(arguments)
-    for name, least in (("views", 5), ("trials", 1), ("parts", 1), ("gl_parts", 0), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be at least {least}")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
-    return options
+    return command.checked(parser, arguments, views=5, trials=1, parts=1, gl_parts=0, seed=0)
 
 
 # -- the sensor cameras -------------------------------------------------------------------------------------

@@ -9,18 +9,18 @@ from experiments import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import sys
+from pathlib import Path
 
-from tqdm import tqdm  # noqa: E402
+from tqdm import tqdm
 
-import agents  # noqa: E402
-from experiments import results, trials  # noqa: E402
-from experiments.pictures import Recorder  # noqa: E402
-from seal_gym.core.errors import RenderError, SealGymError  # noqa: E402
-from seal_gym.envs.config import PERCEPTIONS, RENDERERS  # noqa: E402
-from seal_gym.workpieces.catalogue import NAMES  # noqa: E402
+import agents
+from experiments import command, results, trials
+from experiments.pictures import Recorder
+from seal_gym.core.errors import RenderError, SealGymError
+from seal_gym.envs.config import PERCEPTIONS, RENDERERS
+from seal_gym.workpieces.catalogue import NAMES
 
 _SEAM = Path(__file__).resolve().parent / "data" / "s_curve.csv"
 
@@ -52,14 +52,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder (default: %(default)s)")
     parser.add_argument("--no-video", action="store_true", help="no videos; the plots need no OpenGL")
-    options = parser.parse_args(arguments)
-    for name, least in (("trials", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
+    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if options.seam and options.seam.suffix != ".csv":
         parser.error(f"--seam {options.seam}: must be a .csv file with rows x,y,z,ax,ay,az in m")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
     return options
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import seal_gym
+from agents.provenance import commit
 from experiments import results, trials
 
 Row = dict[str, Any]
@@ -115,7 +116,7 @@ def write(out: Path, name: str, arguments: list[str], rows: list[Row], document:
         "name": name,
         "version": seal_gym.__version__,
         "command": shlex.join(["python", "-m", f"experiments.{name}", *arguments]),
-        "git_commit": results.commit(),
+        "git_commit": commit(),
         "stack": results.stack(),
         "renderer": "raycast",
         "regime": "static",

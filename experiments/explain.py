@@ -16,31 +16,29 @@ from experiments import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import sys  # noqa: E402
-from collections.abc import Iterator, Sequence  # noqa: E402
-from dataclasses import replace  # noqa: E402
-from importlib import import_module  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any, NamedTuple  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-from tqdm import tqdm  # noqa: E402
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
 
-import agents  # noqa: E402
-from agents.episodes import tip_acceleration, tip_scale  # noqa: E402
-from experiments import inspect, recording, trials  # noqa: E402
-from experiments.explain_plot import AXES, Story, plot_story  # noqa: E402
-from seal_gym.core.errors import ConfigError, SealGymError  # noqa: E402
-from seal_gym.core.frames import Array  # noqa: E402
-from seal_gym.envs.adapters import RmpAdapter, TipAdapter  # noqa: E402
-from seal_gym.envs.config import PERCEPTIONS, RENDERERS  # noqa: E402
-from seal_gym.envs.core import SealCore  # noqa: E402
-from seal_gym.envs.seal_env import SealEnv  # noqa: E402
-from seal_gym.rmp import TipRmp  # noqa: E402
-from seal_gym.sim.scene import Scene  # noqa: E402
-from seal_gym.workpieces.catalogue import NAMES  # noqa: E402
+import agents
+from agents.episodes import tip_acceleration
+from experiments import command, inspect, recording, trials
+from experiments.explain_plot import AXES, Story, plot_story
+from seal_gym.core.errors import ConfigError
+from seal_gym.core.frames import Array
+from seal_gym.envs.adapters import RmpAdapter, TipAdapter, tip_scale
+from seal_gym.envs.core import SealCore
+from seal_gym.envs.seal_env import SealEnv
+from seal_gym.rmp import TipRmp
+from seal_gym.sim.scene import Scene
 
 _MM, _DEG = 1e3, float(np.rad2deg(1.0))
 _PARTS = (("translation", "m_s2", slice(0, 3)), ("rotation", "rad_s2", slice(3, 6)))
@@ -114,7 +112,7 @@ def decide(core: SealCore, action: NDArray[np.float32]) -> Decision:
     if isinstance(adapter, RmpAdapter):
         policies = adapter.tip_policies(given, state)
     elif isinstance(adapter, TipAdapter):
-        policies = {"policy": TipRmp(given * tip_scale(core.cfg.cell), np.zeros((1, 6, 6)))}
+        policies = {"policy": TipRmp(given * tip_scale(core.cfg.cell.limits), np.zeros((1, 6, 6)))}
     else:
         raise ConfigError(f"control = {core.cfg.control!r}: only 'rmp' and 'tip' act at the tip")
     return Decision(policies, tip_acceleration(adapter(given, state), state)[0])
@@ -310,27 +308,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         default="neural_rmp",
         help=f"one of {', '.join(sorted(agents.POLICIES))}, or the path of weights (default: %(default)s)",
     )
-    parser.add_argument("--workpiece", default="rectangular", choices=NAMES, help="(default: %(default)s)")
-    parser.add_argument(
-        "--seam", type=Path, help="a seam of yours instead: CSV with rows x,y,z,ax,ay,az in m"
-    )
-    parser.add_argument("--perception", default="vision", choices=PERCEPTIONS, help="(default: %(default)s)")
-    parser.add_argument("--renderer", default=RENDERERS[0], choices=RENDERERS, help="of the sensor images")
-    parser.add_argument("--seed", type=int, default=500_000, help="of the run (default: %(default)s)")
-    parser.add_argument(
-        "--every",
-        type=int,
-        default=2,
-        help="record each n-th frame's images and arrows (default: %(default)s)",
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/explain"), help="folder (default: %(default)s)")
-    options = parser.parse_args(arguments)
-    for name, least in (("every", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
-    return options
+    command.add_run(parser, "out/explain")
+    return command.checked(parser, arguments, every=1, seed=0)
 
 
 def explain(options: argparse.Namespace) -> Story:
@@ -349,12 +328,7 @@ def explain(options: argparse.Namespace) -> Story:
     short = trials.Trial(method=options.policy, workpiece=part, seed=options.seed).part
     name = Path(options.policy).stem
     stem = f"{short}_{name}_{options.perception}_{options.seed}"
-    env = SealEnv(
-        workpiece=trials.workpiece(part),
-        control=agents.control_of(options.policy),
-        perception=options.perception,
-        renderer=options.renderer,
-    )
+    env = inspect.environment(options)
     policy = agents.load_policy(options.policy, env)
     core = env.core
     scene, seam = core.scene, core.scene.workpiece.seam
@@ -393,14 +367,7 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        found = explain(options)
-    except SealGymError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    sys.stdout.write(f"\n{report(found)}\n\nwritten to {options.out}/\n")
-    return 0
+    return command.run(lambda: report(explain(options)), options.out)
 
 
 if __name__ == "__main__":

@@ -9,32 +9,28 @@ from experiments import backend
 
 _GL = backend.choose()
 
-import argparse  # noqa: E402  # the backend has to be chosen before mujoco is imported
-import sys  # noqa: E402
-from collections.abc import Iterator  # noqa: E402
-from copy import deepcopy  # noqa: E402
-from dataclasses import dataclass, replace  # noqa: E402
-from pathlib import Path  # noqa: E402
+import argparse  # the backend has to be chosen before mujoco is imported
+import sys
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass, replace
 
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-from tqdm import tqdm  # noqa: E402
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
 
-import agents  # noqa: E402
-from experiments import recording, trials  # noqa: E402
-from experiments.pictures import FeatureTrace, plot_features  # noqa: E402
-from seal_gym.core.errors import SealGymError  # noqa: E402
-from seal_gym.core.frames import Array  # noqa: E402
-from seal_gym.core.kinematics import tip_kinematics  # noqa: E402
-from seal_gym.envs.adapters import ArmState, RmpAdapter  # noqa: E402
-from seal_gym.envs.config import PERCEPTIONS, RENDERERS  # noqa: E402
-from seal_gym.envs.core import SealCore  # noqa: E402
-from seal_gym.envs.seal_env import SealEnv  # noqa: E402
-from seal_gym.rmp import TipRmp, reference_twist, seam_policies  # noqa: E402
-from seal_gym.vision import overlay  # noqa: E402
-from seal_gym.vision.features import RoiFeatures, ViewGeometry, oracle_lines, update_features  # noqa: E402
-from seal_gym.workpieces.catalogue import NAMES  # noqa: E402
-from seal_gym.workpieces.seam import seam_in_world  # noqa: E402
+import agents
+from experiments import command, recording, trials
+from experiments.pictures import FeatureTrace, plot_features
+from seal_gym.core.frames import Array
+from seal_gym.core.kinematics import tip_kinematics
+from seal_gym.envs.adapters import ArmState, RmpAdapter
+from seal_gym.envs.core import SealCore
+from seal_gym.envs.seal_env import SealEnv
+from seal_gym.rmp import TipRmp, reference_twist, seam_policies
+from seal_gym.vision import overlay
+from seal_gym.vision.features import RoiFeatures, ViewGeometry, oracle_lines, update_features
+from seal_gym.workpieces.seam import seam_in_world
 
 _MM, _DEG = 1e3, float(np.rad2deg(1.0))
 _TIP_ACCEL = slice(17, 23)  # in the observation
@@ -232,27 +228,28 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         prog="python -m experiments.inspect", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--policy", default="rmp_expert", choices=sorted(agents.POLICIES))
-    parser.add_argument("--workpiece", default="rectangular", choices=NAMES, help="(default: %(default)s)")
-    parser.add_argument(
-        "--seam", type=Path, help="a seam of yours instead: CSV with rows x,y,z,ax,ay,az in m"
+    command.add_run(parser, "out/inspect")
+    return command.checked(parser, arguments, every=1, seed=0)
+
+
+def environment(options: argparse.Namespace) -> SealEnv:
+    """The environment of the run.
+
+    Args:
+        options: The command line.
+
+    Returns:
+        With the control mode that the policy needs.
+
+    Raises:
+        SealGymError: If the policy, the workpiece or the renderer cannot be had.
+    """
+    return SealEnv(
+        workpiece=trials.workpiece(str(options.seam or options.workpiece)),
+        control=agents.control_of(options.policy),
+        perception=options.perception,
+        renderer=options.renderer,
     )
-    parser.add_argument("--perception", default="vision", choices=PERCEPTIONS, help="(default: %(default)s)")
-    parser.add_argument("--renderer", default=RENDERERS[0], choices=RENDERERS, help="of the sensor images")
-    parser.add_argument("--seed", type=int, default=500_000, help="of the run (default: %(default)s)")
-    parser.add_argument(
-        "--every",
-        type=int,
-        default=2,
-        help="record each n-th frame's images and leaves (default: %(default)s)",
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/inspect"), help="folder (default: %(default)s)")
-    options = parser.parse_args(arguments)
-    for name, least in (("every", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
-    return options
 
 
 def inspect(options: argparse.Namespace) -> FeatureTrace:
@@ -270,12 +267,7 @@ def inspect(options: argparse.Namespace) -> FeatureTrace:
     name = str(options.seam or options.workpiece)
     trial = trials.Trial(method=options.policy, workpiece=name, seed=options.seed)
     stem = f"{trial.part}_{options.perception}_{options.seed}"
-    env = SealEnv(
-        workpiece=trials.workpiece(name),
-        control=agents.control_of(options.policy),
-        perception=options.perception,
-        renderer=options.renderer,
-    )
+    env = environment(options)
     scene = env.core.scene
     writer = None
     if (missing := recording.missing()) is None:
@@ -313,14 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        found = inspect(options)
-    except SealGymError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    sys.stdout.write(f"\n{report(found)}\n\nwritten to {options.out}/\n")
-    return 0
+    return command.run(lambda: report(inspect(options)), options.out)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 import agents
 import seal_gym
 from agents.enjoy import find_policy
-from agents.train_sb3 import VALIDATION_SEED, play, summary
+from agents.episodes import FIRST_VALIDATION_SEED
+from agents.rollouts import play
+from agents.train_sb3 import summary
 from experiments import results
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.envs.sb3 import make_sb3_vec
@@ -152,7 +154,7 @@ def levels(env_id: str, episodes: int, perception: str, cloned: Iterable[Path] =
         for name, policy in policies.items():
             rows.append(
                 {"policy": name, "env": env_id, "control": control, "perception": perception}
-                | summary(play(policy, venv, VALIDATION_SEED))
+                | summary(play(policy, venv, FIRST_VALIDATION_SEED))
             )
         venv.close()
     return rows
@@ -237,7 +239,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     episodes = rows[0]["episodes"]
     lines += [
         "",
-        f"Each figure from {episodes} validation episodes (seeds {VALIDATION_SEED:,} on). Goal: at least "
+        f"Each figure from {episodes} validation episodes (seeds {FIRST_VALIDATION_SEED:,} on). Goal: at "
+        "least "
         f"{GOAL_REACHED_PCT:.0f} % reached at an RMSE of at most {GOAL_RMSE_MM:.0f} mm; RMSE and time over "
         "the episodes that reached; the last evaluation of each run.",
     ]

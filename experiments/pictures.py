@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import imageio.v2 as imageio
 import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.video import open_video
 from seal_gym.core.frames import Array
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.workpieces.surface import Surface
@@ -114,11 +114,9 @@ class Recorder:
         Args:
             path: The file.
         """
-        with imageio.get_writer(
-            path, fps=30, codec="libx264", quality=7, macro_block_size=8, pixelformat="yuv420p"
-        ) as writer:
+        with open_video(path) as writer:
             for frame in self.frames:
-                writer.append_data(frame)  # type: ignore[attr-defined]  # imageio types the reader's base
+                writer.append_data(frame)
 
     def plot(self, path: Path, title: str) -> None:
         """Plots path against seam from top and side, and the error along the seam.

@@ -8,12 +8,12 @@ from experiments.report_tables import Row
 
 # In units of the drawing, which the page shows at 1 px or less each: readable on a phone.
 WIDTH = 360
-_LEFT, _RIGHT = 132, 64
+_LEFT, _RIGHT = 158, 60
 _ROW, _HEADING, _GAP, _TOP, _BOTTOM = 19, 20, 6, 6, 36
 _LOG_FROM = 30.0  # ratio of largest to smallest value
 _MOST_ROWS = 60
 _COLOURS = 6
-_NAME = 18  # characters that fit beside the plot
+_NAME = 21  # characters that fit beside the plot
 
 
 class Dot(NamedTuple):

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,8 @@ import numpy as np
 from scipy import stats
 
 import seal_gym
+from agents.provenance import commit
+from seal_gym.core.provenance import versions
 
 _STACK = (
     "python",
@@ -124,26 +125,7 @@ def stack() -> dict[str, str]:
     Returns:
         Version by package.
     """
-    found = {"python": sys.version.split()[0]}
-    for name in _STACK[1:]:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
-def commit() -> str | None:
-    """Hash of the checkout's commit.
-
-    Returns:
-        The hash, None outside a repository.
-    """
-    root = Path(__file__).resolve().parents[1]
-    run = subprocess.run(
-        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return run.stdout.strip() if run.returncode == 0 else None
+    return versions(_STACK)
 
 
 def dirty() -> bool:

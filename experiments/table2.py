@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments import results, trials
+from experiments import command, results, trials
 from experiments.table2_report import FEATURES, REGIONS, Method, markdown, plot, summarise
 from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import SealGymError
@@ -356,14 +356,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=10.0, help="measured of each (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/table2"), help="folder (default: %(default)s)")
-    options = parser.parse_args(arguments)
-    for name, least in (("trials", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
+    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if not 0.1 <= options.seconds <= 20.0:
         parser.error(f"--seconds {options.seconds}: must be within 0.1..20: the seams take 22 s and more")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
     return options
 
 

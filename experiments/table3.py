@@ -18,7 +18,7 @@ import numpy as np
 
 import agents
 from agents.policies import KINDS, read_card
-from experiments import results, shapes, table3_figures, table3_report, trials
+from experiments import command, results, shapes, table3_figures, table3_report, trials
 from experiments.table3_report import METHODS
 from experiments.trials import Row, Trial
 from seal_gym.core.errors import ConfigError, SealGymError, require
@@ -356,14 +356,11 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/table3"), help="folder (default: %(default)s)")
     parser.add_argument("--redraw", action="store_true", help="draw the figures of a table in OUT again")
-    options = parser.parse_args(arguments)
+    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if options.shape_trials is None:
         options.shape_trials = min(options.trials, SHAPE_TRIALS)
-    for name, least in (("trials", 1), ("shape_trials", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be at least {least}")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
+    if options.shape_trials < 1:
+        parser.error(f"--shape-trials {options.shape_trials}: must be at least 1")
     return options
 
 

@@ -2,10 +2,8 @@
 
 import hashlib
 import json
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,9 +17,13 @@ from tqdm import tqdm
 
 import agents
 import seal_gym
+from agents.processes import pool
+from agents.provenance import ROOT
+from agents.rollouts import play_once
 from experiments import results, shapes
 from seal_gym.core.errors import ConfigError, SeamError
 from seal_gym.core.frames import Array
+from seal_gym.core.provenance import digest
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
 from seal_gym.envs.seal_env import SealEnv
@@ -170,13 +172,14 @@ def code() -> str:
     Returns:
         Sixteen hexadecimal digits.
     """
-    root = Path(__file__).resolve().parents[1]
-    digest = hashlib.sha256(json.dumps(results.stack(), sort_keys=True).encode())
-    for folder in ("agents", "assets", "experiments", "seal_gym"):
-        for file in sorted((root / folder).rglob("*")):
-            if file.suffix in _SOURCES and not (folder == "experiments" and file.name in _NO_ROW_DEPENDS_ON):
-                digest.update(file.read_bytes())
-    return digest.hexdigest()[:16]
+    files = {
+        str(file.relative_to(ROOT)): file
+        for folder in ("agents", "assets", "experiments", "seal_gym")
+        for file in (ROOT / folder).rglob("*")
+        if file.suffix in _SOURCES and not (folder == "experiments" and file.name in _NO_ROW_DEPENDS_ON)
+    }
+    packages = json.dumps(results.stack(), sort_keys=True)
+    return hashlib.sha256((digest(files) + packages).encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=256)
@@ -190,11 +193,9 @@ def code_of(source: str) -> str:
         Sixteen hexadecimal digits.
     """
     file = Path(source) if Path(source).suffix else agents.WEIGHTS / f"{source}.safetensors"
-    digest = hashlib.sha256(code().encode())
     # Whatever stands beside the weights under their name: the card, or gains in a file of their own.
-    for beside in sorted(file.parent.glob(f"{file.stem}.*")):
-        digest.update(beside.name.encode() + beside.read_bytes())
-    return digest.hexdigest()[:16]
+    beside = {f.name: f for f in file.parent.glob(f"{file.stem}.*")}
+    return hashlib.sha256((code() + digest(beside)).encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=32)
@@ -287,17 +288,9 @@ def run(trial: Trial, observer: Observer | None = None, render_mode: str | None 
     policy = agents.load_policy(trial.weights or trial.method, env)
     core = env.unwrapped
     assert isinstance(core, SealEnv)
-    observation, info = env.reset(seed=trial.seed)
-    state, start, done = None, np.array([True]), False
-    if observer:
-        observer(core, info)
-    while not done:
-        action, state = policy.predict(observation, state=state, episode_start=start)
-        observation, _, terminated, truncated, info = env.step(action)
-        start, done = np.array([False]), terminated or truncated
-        if observer:
-            observer(core, info)
-    return _row(trial, info["episode_metrics"])
+    metrics = play_once(policy, env, trial.seed, observer and (lambda _, info: observer(core, info)))
+    del metrics["return"]  # depends on the reward's weights: no table has it
+    return _row(trial, metrics)
 
 
 def _row(trial: Trial, metrics: dict[str, Any]) -> Row:
@@ -314,13 +307,6 @@ def _row(trial: Trial, metrics: dict[str, Any]) -> Row:
 @lru_cache(maxsize=2)
 def _core(part: str, control: str, kwargs: str, n: int) -> SealCore:
     return SealCore(SealCfg.of(workpiece=workpiece(part), control=control, **json.loads(kwargs)), n)
-
-
-def _tips_mm(core: SealCore) -> Array:
-    """The tips in the parts' frames, shape (N, 3), mm."""
-    part = core.arm.part_pose
-    offset = core.tip.pose[:, :3, 3] - part[:, :3, 3]
-    return np.asarray(1e3 * np.einsum("nji,nj->ni", part[:, :3, :3], offset))
 
 
 def run_together(batch: Sequence[Trial]) -> list[Row]:
@@ -342,34 +328,31 @@ def run_together(batch: Sequence[Trial]) -> list[Row]:
     waiting = iter(range(n, len(batch)))
     which: list[int | None] = list(range(n))
 
-    def start(i: int, trial: Trial) -> None:
-        core.reset(i, seeding.np_random(trial.seed)[0])
+    def begin(i: int, k: int | None) -> None:
+        which[i] = k
+        # With nothing left to do, the simulation goes on with any trial: nobody looks.
+        core.reset(i, seeding.np_random(batch[k or 0].seed)[0])
+        if k is not None:
+            paths[k].append(1e3 * core.tip_in_part()[i])
 
     for i in range(n):
-        start(i, batch[i])
+        begin(i, i)
     state, starts = None, np.ones(n, np.bool_)
-    observation = core.observe()
-    while True:
-        tips = _tips_mm(core)
-        for i, k in enumerate(which):
-            if k is not None and core.frames[i] % _PATH_EVERY == 0:
-                paths[k].append(tips[i])
-        action, state = policy.predict(observation, state=state, episode_start=starts)
+    while len(ended) < len(batch):
+        action, state = policy.predict(core.observe(), state=state, episode_start=starts)
         result = core.step(action)
         starts = result.terminated | result.timeout
-        tips = _tips_mm(core)
+        tips = 1e3 * core.tip_in_part()
+        for i, k in enumerate(which):
+            if k is not None and (starts[i] or core.frames[i] % _PATH_EVERY == 0):
+                paths[k].append(tips[i])
         for i in map(int, np.flatnonzero(starts)):
             k = which[i]
             if k is not None:
-                paths[k].append(tips[i])
                 path = np.round(paths[k], 3).tolist()
                 ended[k] = {**_row(batch[k], core.episode_metrics(i, result)), "path_mm": path}
-            # With nothing left to do, the simulation goes on with any trial: nobody looks.
-            k = which[i] = next(waiting, None)
-            start(i, batch[k or 0])
-        if len(ended) == len(batch):
-            return [ended[k] for k in range(len(batch))]
-        observation = core.observe()
+            begin(i, next(waiting, None))
+    return [ended[k] for k in range(len(batch))]
 
 
 def run_all(
@@ -434,16 +417,10 @@ def _results(
         for batch in batches:
             yield batch, work(batch)
         return
-    # Fresh processes: a forked one would share OpenGL contexts and threads with this one.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(batches)), mp_context=context, initializer=_one_thread) as pool:
-        running = {pool.submit(work, batch): batch for batch in batches}
+    with pool(min(jobs, len(batches))) as workers:
+        running = {workers.submit(work, batch): batch for batch in batches}
         for future in as_completed(running):
             yield running[future], future.result()
-
-
-def _one_thread() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def _code(trial: Trial) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from experiments import edge_tables
+from experiments import command, edge_tables
 from experiments.edge_tables import Log, Row
 from experiments.seam_frames import (
     FIRST_SEED,
@@ -263,10 +263,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--settings", type=int, default=48, help="random settings of a method")
     parser.add_argument("--method", action="append", choices=sorted(METHODS), help="default: all")
     parser.add_argument("--out", type=Path, default=Path("out/tune_edges"), help="folder")
-    options = parser.parse_args(arguments)
-    for name, least in (("frames", 2), ("settings", 1)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
+    options = command.checked(parser, arguments, frames=2, settings=1)
     try:
         check_seeds(options.seed, options.frames)
     except SealGymError as error:

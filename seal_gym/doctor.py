@@ -28,18 +28,20 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import InvalidVersion, Version
 
 import seal_gym
 from seal_gym.core.frames import Array
 from seal_gym.core.paths import asset
+from seal_gym.core.provenance import digest, version
 
 HASHES = Path(__file__).with_name("rollout_hashes.json")
 _PACKAGE = Path(__file__).parent
 
 # -- packages ---------------------------------------------------------------------------------------------
 
-_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;\s*(.*))?$")
-_CLAUSE = re.compile(r"^(>=|<=|==|<|>)\s*([0-9][^\s]*)$")
 _EXTRAS = ("sb3", "imitation", "ray", "viz")  # what users install; test and dev tools decide no result
 
 
@@ -51,7 +53,7 @@ class Package(NamedTuple):
         extra: The extra that asks for it, empty for the core.
         tested: The range, e.g. ``>=4.0,<5``.
         installed: The version, None if there is none.
-        state: ``ok``, ``outside``, ``unknown`` (range or version not understood), ``absent`` (of an extra) or
+        state: ``ok``, ``outside``, ``unknown`` (no version number), ``absent`` (of an extra) or
             ``missing`` (of the core).
     """
 
@@ -60,42 +62,6 @@ class Package(NamedTuple):
     tested: str
     installed: str | None
     state: str
-
-
-def _numbers(version: str) -> tuple[int, ...] | None:
-    """Release numbers without trailing zeros; None for a pre-release, which comes before its release."""
-    match = re.fullmatch(r"v?(\d+(?:\.\d+)*)((?:\.post\d+)?(?:\+.*)?)", version)
-    if match is None:
-        return None
-    numbers = [int(n) for n in match[1].split(".")]
-    while len(numbers) > 1 and numbers[-1] == 0:
-        numbers.pop()
-    return tuple(numbers)
-
-
-def within(version: str, tested: str) -> bool | None:
-    """Whether a version lies in a range.
-
-    Args:
-        version: Such as ``"4.0.1"``.
-        tested: Clauses with ``>=``, ``<=``, ``==``, ``<`` or ``>``, separated by commas.
-
-    Returns:
-        The answer; None if either is written in another way.
-    """
-    found = _numbers(version)
-    clauses = [_CLAUSE.match(c.strip()) for c in tested.split(",") if c.strip()]
-    if found is None or not all(clauses):
-        return None
-    for clause in clauses:
-        assert clause is not None
-        bound = _numbers(clause[2])
-        if bound is None:
-            return None
-        order = (found > bound) - (found < bound)
-        if order not in {">=": (0, 1), "<=": (-1, 0), "==": (0,), "<": (-1,), ">": (1,)}[clause[1]]:
-            return False
-    return True
 
 
 def requirements() -> list[tuple[str, str, str]]:
@@ -107,29 +73,28 @@ def requirements() -> list[tuple[str, str, str]]:
     project = _PACKAGE.parent / "pyproject.toml"
     if project.exists():
         table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
-        lines = [(line, "") for line in (f"python {table['requires-python']}", *table["dependencies"])]
+        lines = [(line, "") for line in (f"python{table['requires-python']}", *table["dependencies"])]
         lines += [(line, extra) for extra in _EXTRAS for line in table["optional-dependencies"][extra]]
     else:
         lines = [(line, "") for line in metadata.requires("seal-gym") or ()]
-        lines.insert(0, (f"python {metadata.metadata('seal-gym')['Requires-Python']}", ""))
+        lines.insert(0, (f"python{metadata.metadata('seal-gym')['Requires-Python']}", ""))
     out = []
     for line, extra in lines:
-        match = _REQUIREMENT.match(line)
-        assert match is not None, line
-        marked = re.search(r"""extra\s*==\s*['"]([^'"]+)""", match[3] or "")
-        wanted_by = marked[1] if marked else extra
-        if match[1] != "seal-gym" and wanted_by in ("", *_EXTRAS):
-            out.append((match[1], wanted_by, match[2].strip()))
+        found = Requirement(line)
+        # Installed metadata have the extra in the marker.
+        wanted = [e for e in ("", *_EXTRAS) if found.marker is None or found.marker.evaluate({"extra": e})]
+        if found.name != "seal-gym" and wanted:
+            out.append((found.name, extra or wanted[0], str(found.specifier)))
     return out
 
 
-def _version(name: str) -> str | None:
-    if name == "python":
-        return platform.python_version()
+def _judged(installed: str | None, tested: str, extra: str) -> str:
+    if installed is None:
+        return "absent" if extra else "missing"
     try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
+        return "ok" if SpecifierSet(tested).contains(Version(installed)) else "outside"
+    except InvalidVersion:
+        return "unknown"
 
 
 def packages() -> list[Package]:
@@ -140,11 +105,8 @@ def packages() -> list[Package]:
     """
     out: dict[str, Package] = {}
     for name, extra, tested in requirements():
-        installed = _version(name)
-        if installed is None:
-            state = "absent" if extra else "missing"
-        else:
-            state = {True: "ok", False: "outside", None: "unknown"}[within(installed, tested)]
+        installed = version(name)
+        state = _judged(installed, tested, extra)
         out.setdefault(name, Package(name, extra, tested, installed, state))
     return list(out.values())
 
@@ -403,7 +365,7 @@ def stack() -> dict[str, str]:
     Returns:
         Versions of mujoco, numpy, numba and scipy, and the machine's architecture.
     """
-    return {name: _version(name) or "none" for name in _KEY} | {"machine": platform.machine()}
+    return {name: version(name) or "none" for name in _KEY} | {"machine": platform.machine()}
 
 
 def _cpu() -> str:
@@ -429,10 +391,7 @@ def code_hash() -> str:
         # of the installed package: its own assets are counted under their own name
         and not (name == "seal_gym" and file.is_relative_to(root / "assets"))
     }
-    digest = hashlib.sha256()
-    for name in sorted(files):
-        digest.update(name.encode() + b"\0" + files[name].read_bytes() + b"\0")
-    return digest.hexdigest()[:16]
+    return digest(files)
 
 
 def entry(found: dict[str, dict[str, Rollout]]) -> dict[str, Any]:
@@ -444,7 +403,7 @@ def entry(found: dict[str, dict[str, Rollout]]) -> dict[str, Any]:
     Returns:
         Plain data for JSON.
     """
-    also = {name: _version(name) for name in ("python", "opencv-python-headless", "filterpy", "gymnasium")}
+    also = {name: version(name) for name in ("python", "opencv-python-headless", "filterpy", "gymnasium")}
     return {
         "stack": stack(),
         "seal_gym": seal_gym.__version__,

@@ -80,7 +80,15 @@ class Adapter(Protocol):
         """
 
 
-def _tip_scale(limits: LimitsCfg) -> Array:
+def tip_scale(limits: LimitsCfg) -> Array:
+    """Tip accelerations that actions of 1 mean.
+
+    Args:
+        limits: Of the cell.
+
+    Returns:
+        Shape (6,), m/s^2 and rad/s^2.
+    """
     return np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
 
 
@@ -95,7 +103,7 @@ class TipAdapter:
         Args:
             cell: The cell.
         """
-        self._scale = _tip_scale(cell.limits)
+        self._scale = tip_scale(cell.limits)
         self._metric = np.eye(6)[None]
 
     def __call__(self, action: Array, state: ArmState) -> Array:
@@ -130,7 +138,7 @@ class RmpAdapter:
             sealing: Configuration of the fixed leaves.
         """
         self.leaves = list(leaves)
-        self._scale = _tip_scale(cell.limits)
+        self._scale = tip_scale(cell.limits)
         self._speed = cell.process.speed_m_s
         self._sealing = sealing or SealingCfg()
 

@@ -254,7 +254,7 @@ class SealCore:
         self.frames += 1
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
-        self.progress.advance(self._tip_in_part(), self._seam_speed())
+        self.progress.advance(self.tip_in_part(), self._seam_speed())
         return self._judge(touched, action, before, error)
 
     def observe(self, rows: NDArray[np.bool_] | None = None) -> Observation:
@@ -305,7 +305,8 @@ class SealCore:
         self._tip_accel = (command.jacobian @ qdd[:, :, None])[..., 0] + command.drift
         self.tip = tip_kinematics(self.arm.q, self.arm.qd)
 
-    def _tip_in_part(self) -> Array:
+    def tip_in_part(self) -> Array:
+        """The tips in the parts' frames, shape (N, 3), m."""
         part = self.arm.part_pose
         offset = self.tip.pose[:, :3, 3] - part[:, :3, 3]
         return np.ascontiguousarray((offset[:, None] @ part[:, :3, :3])[:, 0])

@@ -1,5 +1,4 @@
 import json
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -87,7 +86,7 @@ def test_scores_of_the_expert_and_of_one_that_does_nothing():
     good = rollouts.score(RmpExpert(), workpiece="cylinder", trials=2, perception="oracle")
     assert (good["trials"], good["reached"], good["collision"], good["timeout"]) == (2, 2, 0, 0)
     assert good["rmse_mm"] < 0.05
-    still = SimpleNamespace(control="tip", predict=lambda o: (np.zeros((len(o), 6), np.float32), None))
+    still = SimpleNamespace(control="tip", predict=lambda o, **_: (np.zeros((len(o), 6), np.float32), None))
     bad = rollouts.score(still, workpiece="cylinder", trials=1, perception="oracle")
     assert (bad["reached"], bad["timeout"], bad["rmse_mm"]) == (0, 1, None)
 
@@ -285,19 +284,8 @@ def test_the_command_writes_a_policy_that_loads(episodes, tmp_path, monkeypatch,
         actions=lambda control: getattr(stacked, control),
         episodes=list(pairwise(lengths)),
     )
-    monkeypatch.setitem(sys.modules, "agents.demos", SimpleNamespace(load=lambda _: data))
-    options = [
-        "--policy",
-        "neural_control",
-        "--seed",
-        "4",
-        "--data",
-        "D",
-        "--out",
-        str(tmp_path),
-        "--epochs",
-        "2",
-    ]
+    monkeypatch.setattr(train_bc.demos, "load", lambda _: data)
+    options = "--policy neural_control --seed 4 --data D --epochs 2 --out".split() + [str(tmp_path)]
     train_bc.main([*options, "--validate", "1", "--perception", "oracle"])
     path = tmp_path / "neural_control-seed4.safetensors"
     assert str(path) in capsys.readouterr().out

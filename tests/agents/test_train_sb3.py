@@ -13,6 +13,7 @@ import agents
 import seal_gym  # noqa: F401  # registers the ids
 from agents import policies, sb3_policies
 from agents.policies import PolicyFileError
+from agents.rollouts import play
 from agents.sb3_policies import NetCfg, Scale, put_actor
 from agents.train_sb3 import (
     PpoCfg,
@@ -25,7 +26,6 @@ from agents.train_sb3 import (
     main,
     make_model,
     parse,
-    play,
     read_about,
     summary,
     training_env,

@@ -14,6 +14,7 @@ import pytest
 
 import agents
 from agents.policies import LearnedPolicy, save
+from agents.provenance import commit
 from experiments import results, table3, table3_figures, table3_report, trials
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -219,7 +220,7 @@ def test_runs_on_published_seeds_are_logged_and_no_others(tmp_path, monkeypatch)
     lines = [line for line in log.read_text().splitlines() if "experiments.table3" in line]
     assert len(lines) == 2
     assert "`python -m experiments.table3 --seed 1000000` | Table 3 |" in lines[0]
-    assert (results.commit() or "no repository") in lines[0]
+    assert (commit() or "no repository") in lines[0]
 
 
 # -- the whole command ------------------------------------------------------------------------------------

@@ -1,0 +1,73 @@
+"""What the experiments' command lines share."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from seal_gym.core.errors import SealGymError
+from seal_gym.envs.config import PERCEPTIONS, RENDERERS
+from seal_gym.workpieces.catalogue import NAMES
+
+
+def checked(parser: argparse.ArgumentParser, arguments: list[str] | None, **least: int) -> argparse.Namespace:
+    """Reads a command line; ends the program with a word on what is out of range.
+
+    Args:
+        parser: With an ``--out``.
+        arguments: Without the program's name; the process's own by default.
+        **least: Smallest value of options that are numbers.
+
+    Returns:
+        The options.
+    """
+    options = parser.parse_args(arguments)
+    for name, low in least.items():
+        if getattr(options, name) < low:
+            parser.error(f"--{name.replace('_', '-')} {getattr(options, name)}: must be at least {low}")
+    if options.out.exists() and not options.out.is_dir():
+        parser.error(f"--out {options.out}: is a file, must be a folder")
+    return options
+
+
+def add_run(parser: argparse.ArgumentParser, out: str) -> None:
+    """Adds the options of a command that looks closely at one run.
+
+    Args:
+        parser: The command line.
+        out: The default folder.
+    """
+    parser.add_argument("--workpiece", default="rectangular", choices=NAMES, help="(default: %(default)s)")
+    parser.add_argument(
+        "--seam", type=Path, help="a seam of yours instead: CSV with rows x,y,z,ax,ay,az in m"
+    )
+    parser.add_argument("--perception", default="vision", choices=PERCEPTIONS, help="(default: %(default)s)")
+    parser.add_argument("--renderer", default=RENDERERS[0], choices=RENDERERS, help="of the sensor images")
+    parser.add_argument("--seed", type=int, default=500_000, help="of the run (default: %(default)s)")
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=2,
+        help="record each n-th frame's images and arrows (default: %(default)s)",
+    )
+    parser.add_argument("--out", type=Path, default=Path(out), help="folder (default: %(default)s)")
+
+
+def run(work: Callable[[], str], out: Path) -> int:
+    """Does a command's work and prints what came of it.
+
+    Args:
+        work: Writes the files, gives the report.
+        out: Their folder; made if need be.
+
+    Returns:
+        Exit status: 2 if it could not be done, with the reason on the standard error.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        text = work()
+    except SealGymError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(f"\n{text}\n\nwritten to {out}/\n")
+    return 0
