@@ -15,6 +15,8 @@ from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.edges import EdgeDetector, grey_sum
+from seal_gym.vision.groove import NO_SECTION, band_centre, coarse_centre, cuts_at
+from seal_gym.vision.groove import FLANK as PLATE_FLANK
 
 Grey = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -23,6 +25,7 @@ _HALF_ROWS = 2  # a row's profile is the mean of five rows along the edge
 _FLANK = 3  # pixels on either side that give the two grey levels
 _GAP = 3  # rows without an edge that a chain passes over
 _MAX_POINTS = 1024
+_HALF_PROFILE = 31  # of what a profile holds
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
@@ -229,6 +232,54 @@ def _allowed(mask: Mask, edge: Mask, row: int, column: int) -> bool:
 
 
 @kernel
+def _groove_allowed(mask: Mask, edge: Mask, row: int, o: float, cut: Array) -> bool:
+    """Whether the nozzle hides nothing of groove and banks, and the edge stage found one of them."""
+    width = edge.shape[1]
+    seen = False
+    left, right = o + cut[0], o + cut[2]
+    for x in range(max(int(left) - PLATE_FLANK, 0), min(int(right) + PLATE_FLANK + 1, width)):
+        if mask[row, x]:
+            return False
+        near = min(abs(x + 0.5 - left), abs(x + 0.5 - right)) < 2.0
+        seen = seen or (near and edge[row, x])
+    return bool(seen)
+
+
+@kernel
+def _row_groove(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    row: int,
+    o: float,
+    q: float,
+    search: float,
+    section: Array,
+    par: LineNumbers,
+    profile: Array,
+    found: Array,
+) -> bool:
+    """``row_edge`` of a groove: its middle."""
+    width = grey.shape[1]
+    cut = np.empty(3)
+    cuts_at(section, q, cut)
+    half = min(int(search + cut[2]) + PLATE_FLANK + 2, _HALF_PROFILE)
+    middle = int(np.floor(o + 0.5))
+    # So far from the border that all of a profile's rows, sheared, are in the strip.
+    border = int(_HALF_ROWS * abs(q)) + 1
+    first, last = max(middle - half, border), min(middle + half, width - border)
+    count = last - first
+    if count < 2 * _FLANK or not _profile(grey, row, q, first, count, 1.0, profile):
+        return False
+    if not band_centre(profile, count, o - first, search, cut, found):
+        return False
+    found[0] += first
+    if found[1] < par.min_contrast or abs(found[0] - o) > search + 1.0:
+        return False
+    return bool(_groove_allowed(mask, edge, row, found[0], cut))
+
+
+@kernel
 def row_edge(
     grey: Grey,
     mask: Mask,
@@ -237,11 +288,12 @@ def row_edge(
     o: float,
     q: float,
     search: float,
+    section: Array,
     par: LineNumbers,
     profile: Array,
     found: Array,
 ) -> bool:
-    """The edge near its expected place in a row, to a fraction of a pixel.
+    """The edge, or a groove's middle, near its expected place in a row, to a fraction of a pixel.
 
     Args:
         grey: The strip's sum of channels.
@@ -251,8 +303,9 @@ def row_edge(
         o: Where the edge is expected in it.
         q: The edge's slope: the profile is a mean along it.
         search: How far from there [px].
+        section: Of the groove; ``NO_SECTION`` for an edge.
         par: ``LineCfg.numbers``.
-        profile: Scratch, at least 32 long.
+        profile: Scratch, at least 64 long.
         found: Filled with the place [px] and the step [grey levels].
 
     Returns:
@@ -261,6 +314,8 @@ def row_edge(
     height, width = grey.shape
     if row < 0 or row >= height or not abs(o) < 2.0 * width:
         return False
+    if section[0] > 0.0:
+        return bool(_row_groove(grey, mask, edge, row, o, q, search, section, par, profile, found))
     half = int(search) + 1 + _FLANK
     middle = int(np.floor(o + 0.5))  # a boundary between the pixels middle - 1 and middle
     # Near the border: as much of the search as there is.
@@ -288,11 +343,12 @@ def follow(
     q: float,
     ahead: float,
     behind: float,
+    section: Array,
     par: LineNumbers,
     profile: Array,
     points: Array,
 ) -> int:
-    """Follows the edge from the reference row ahead, then behind.
+    """Follows the edge, or the groove's middle, from the reference row ahead, then behind.
 
     Args:
         grey: The strip's sum of channels.
@@ -303,6 +359,7 @@ def follow(
         q: Expected slope there.
         ahead: How far to go ahead [px].
         behind: How far to go back [px].
+        section: Of the groove; ``NO_SECTION`` for an edge.
         par: ``LineCfg.numbers``.
         profile: Scratch.
         points: Filled with rows t - t_ref, o, step.
@@ -323,7 +380,9 @@ def follow(
         hits = 0
         while abs(row + 0.5 - t_ref) <= reach and missed <= _GAP + 20 * (hits == 0) and abs(slope) < 2.0:
             search = par.search_px if hits == 0 else min(par.search_px, 1.5)
-            if count < len(points) and row_edge(grey, mask, edge, row, o, slope, search, par, profile, found):
+            if count < len(points) and row_edge(
+                grey, mask, edge, row, o, slope, search, section, par, profile, found
+            ):
                 error = found[0] - o
                 o += 0.5 * error
                 slope += way * 0.06 * error
@@ -491,6 +550,64 @@ def ransac_line(
 
 
 @kernel
+def groove_line(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    t_ref: float,
+    section: Array,
+    par: LineNumbers,
+    profile: Array,
+    line: Array,
+) -> bool:
+    """The line through the darkest bands as wide as the groove, one a row.
+
+    Args:
+        grey: The strip's sum of channels.
+        mask: Where the nozzle is.
+        edge: Where the edge stage found an edge.
+        t_ref: The reference's t [px].
+        section: Of the groove.
+        par: ``LineCfg.numbers``.
+        profile: Scratch.
+        line: p and q, filled.
+
+    Returns:
+        Whether there is one.
+    """
+    t, o, vote = np.empty(_MAX_POINTS), np.empty(_MAX_POINTS), np.empty(_MAX_POINTS)
+    cut, found = np.empty(3), np.empty(2)
+    cuts_at(section, 0.0, cut)
+    height, width = grey.shape
+    n = 0
+    for row in range(min(height, _MAX_POINTS)):
+        left = right = 0
+        # The widest stretch of the row beside the nozzle.
+        x = 0
+        while x < width:
+            first = x
+            while x < width and not mask[row, x]:
+                x += 1
+            if x - first > right - left:
+                left, right = first, x
+            x += 1
+        count = min(right, width - 1, left + 2 * _HALF_PROFILE) - left
+        if count < 2 * _FLANK or not _profile(grey, row, 0.0, left, count, 1.0, profile):
+            continue
+        if not coarse_centre(profile, count, 0.5 * count, 0.5 * count, cut, found):
+            continue
+        o[n] = left + found[0]
+        if found[1] < par.min_contrast or not _groove_allowed(mask, edge, row, o[n], cut):
+            continue
+        t[n] = row + 0.5 - t_ref
+        vote[n] = found[1] / (1.0 + (t[n] / par.reach_px) ** 2)
+        n += 1
+    if n < par.min_points:
+        return False
+    return bool(_ransac(t, o, vote, n, par, np.uint64(int(par.seed)), line) > 0.0)
+
+
+@kernel
 def local_line(
     points: Array, n: int, t_ref: float, o_ref: float, p: float, par: LineNumbers, work: Array, line: Array
 ) -> float:
@@ -547,7 +664,18 @@ def _find_batch(
         grey_sum(images[k], grey)
         p, q = raw[k, 0], raw[k, 1]
         count = follow(
-            grey, mask, edge[k], reference[0], p, q, par.window_px, par.window_px, par, profile, points
+            grey,
+            mask,
+            edge[k],
+            reference[0],
+            p,
+            q,
+            par.window_px,
+            par.window_px,
+            NO_SECTION,
+            par,
+            profile,
+            points,
         )
         confidence[k] = local_line(points, count, reference[0], reference[1], p, par, columns, line[k])
         valid[k] = confidence[k] > 0.0

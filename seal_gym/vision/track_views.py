@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
+from seal_gym.vision.groove import SECTION, section_of
 from seal_gym.vision.seam_line import LineNumbers, follow, row_edge
 from seal_gym.vision.seam_memory import fit_memory, remember
 from seal_gym.vision.strip_geometry import normalise, plate_axes, strip_slope, to_strip
@@ -88,18 +89,30 @@ def track_front(
 
     Returns whether the front view showed the seam; without, the memory carries on.
     """
-    line, n, m = np.empty(3), np.empty(3), np.empty(3)
+    line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
+    plate_axes(d, par.plate, n, m)
     seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0 and _usual(i, 0, mask, line, par, state, s)
+    seen = seen and section_of(p, d, n, m, 0, g, par.groove_width_m, par.groove_depth_m, section)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
-            s.grey, mask, s.edge, ref[0], o, line[2], par.ahead_px, par.ahead_px, lp, s.profile, s.points
+            s.grey,
+            mask,
+            s.edge,
+            ref[0],
+            o,
+            line[2],
+            par.ahead_px,
+            par.ahead_px,
+            section,
+            lp,
+            s.profile,
+            s.points,
         )
         seen = count >= MIN_ROWS
         if seen:
             state.clock[i] += 1
             remember(i, tip, count, ref, g, par, state, s)
-    plate_axes(d, par.plate, n, m)
     oldest = max(state.clock[i] - int(par.memory), 0)
     fitted = fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
     if seen and not fitted:
@@ -162,6 +175,7 @@ def _side_residual(
     p: Array,
     d: Array,
     m: Array,
+    section: Array,
     bend: float,
     line: Array,
     scale: float,
@@ -191,7 +205,7 @@ def _side_residual(
         if abs(t) > 1e-9:
             # Chord of a parabola: its end's slope is twice the chord's less the start's.
             slope = min(max(2.0 * (b[1] - line[1]) / t - line[2], -2.0), 2.0)
-        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp.search_px, lp, s.profile, found):
+        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp.search_px, section, lp, s.profile, found):
             continue
         error = found[0] - b[1]
         # Far rows hang on the curve's bend, which is less sure.
@@ -237,13 +251,15 @@ def track_side(
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    per_m, out = np.empty(2), np.empty(5)
+    per_m, out, section = np.empty(2), np.empty(5), np.empty(SECTION)
     plate_axes(d, par.plate, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
+    if not section_of(p, d, n, m, 1, g, par.groove_width_m, par.groove_depth_m, section):
+        return False
     if not _usual(i, 1, mask, line, par, state, s):
         return False
-    if not _side_residual(mask, g, lp, par, s, p, d, m, bend, line, per_m[0], out):
+    if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return False
     # Neighbouring rows share pixels: five times the variance of independent ones.
     noise = 5.0 * par.row_sigma_m**2
