@@ -18,19 +18,29 @@ from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
 from seal_gym.vision.strip_geometry import to_strip
 
-__all__ = ["NO_SECTION", "SECTION", "GrooveCfg", "band_centre", "coarse_centre", "cuts_at", "section_of"]
+__all__ = [
+    "CUTS",
+    "NO_GROOVE",
+    "NO_SECTION",
+    "SECTION",
+    "GrooveCfg",
+    "band_centre",
+    "coarse_centre",
+    "cuts_at",
+    "section_of",
+]
 
-SECTION = 8  # numbers of a section, see ``section_of``
+SECTION, CUTS = 9, 4  # numbers of a section, see ``section_of``, and of its cuts in a row
 NO_SECTION = np.zeros(SECTION)
 FLANK = 4  # pixels of the plate on either side that give its grey level
 
-_GRID, _GRID_PX = 4, 0.25
+_GRID, _GRID_PX = 8, 0.125
 _TURNS = 3
 _LONGEST_PX = 0.25  # step
-# Plate and plate are about as bright, band and band differ: variance of a profile's noise over that of the
-# difference, (2 / 20)^2 and (2 / 60)^2 in grey levels. Where a band is narrow or out of the picture the
+# Plate is about as bright as plate, the floor as dark as expected: variance of a profile's noise over that of
+# what is expected, (2 / 20)^2 in grey levels. Where a band is narrower than a pixel or out of the picture the
 # pixels do not tell its level.
-_SAME_PLATE, _SAME_BAND = 1e-2, 1e-3
+_SAME_PLATE, _SAME_RATIO = 1e-2, 1e-2
 _SMALL_M = 1e-4
 
 
@@ -41,16 +51,32 @@ class GrooveCfg:
     Attributes:
         width_m: From bank to bank [m].
         depth_m: From the plate to the floor [m].
+        floor_share: How much darker than the plate the floor is, as a share of what a wall is. The lamp
+            shines from above, along a wall and square on the floor. Decides only in grooves of less than
+            four pixels, which do not show it.
     """
 
     width_m: float
     depth_m: float
+    floor_share: float = 0.45
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         for name in ("width_m", "depth_m"):
             value = getattr(self, name)
             require(0.0 < value < 0.05, f"GrooveCfg.{name} = {value!r}: must be within (0, 0.05) m")
+        require(
+            0.1 <= self.floor_share <= 10.0,
+            f"GrooveCfg.floor_share = {self.floor_share!r}: must be within 0.1..10",
+        )
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """The same as the kernels take them."""
+        return float(self.width_m), float(self.depth_m), float(self.floor_share)
+
+
+NO_GROOVE = (0.0, 0.0, 1.0)
 
 
 @kernel
@@ -61,8 +87,7 @@ def section_of(
     m: Array,
     view: int,
     g: ViewGeometry,
-    width: float,
-    depth: float,
+    groove: tuple[float, float, float],
     out: Array,
 ) -> bool:
     """What a view makes of a groove near a point of its seam (tip frame), to first order.
@@ -74,17 +99,16 @@ def section_of(
         m: Across the seam in the plate, shape (3,).
         view: 0 front, 1 side.
         g: The cameras.
-        width: Of the groove [m]; 0 for a seam that is an edge.
-        depth: Of the groove [m].
-        out: Filled with half the width, the depth [m], and do/dt of the strip [px] for a metre across, along
-            and down.
+        groove: ``GrooveCfg.numbers``, or ``NO_GROOVE`` for a seam that is an edge.
+        out: Filled with half the width, the depth [m], o and t of the strip [px] for a metre across, along
+            and down, and the floor's share of darkness.
 
     Returns:
         False if the point is behind the camera.
     """
     for k in range(SECTION):
         out[k] = 0.0
-    if width <= 0.0:
+    if groove[0] <= 0.0:
         return True
     a, b, x = np.empty(2), np.empty(2), np.empty(3)
     if not to_strip(p, view, g, a):
@@ -96,7 +120,7 @@ def section_of(
         if not to_strip(x, view, g, b):
             return False
         out[2 + 2 * axis], out[3 + 2 * axis] = (b[1] - a[1]) / _SMALL_M, (b[0] - a[0]) / _SMALL_M
-    out[0], out[1] = 0.5 * width, depth
+    out[0], out[1], out[8] = 0.5 * groove[0], groove[1], groove[2]
     return True
 
 
@@ -107,7 +131,8 @@ def cuts_at(section: Array, q: float, cut: Array) -> None:
     Args:
         section: From ``section_of``.
         q: Slope of the seam's image in the row: on a bend it differs from that of the section's direction.
-        cut: Filled, shape (3,), increasing.
+        cut: Filled with the three, increasing, and how dark the second band is for each grey level that the
+            first one is, shape (4,).
     """
     o_m, t_m, o_d, t_d, o_z, t_z = section[2], section[3], section[4], section[5], section[6], section[7]
     det = o_m * t_d - t_m * o_d
@@ -118,6 +143,7 @@ def cuts_at(section: Array, q: float, cut: Array) -> None:
     cut[0], cut[2] = -half, half
     # From the right one looks at the left wall, down to the floor's corner, and the other way round.
     cut[1] = min(down - half, half) if down > 0.0 else max(down + half, -half)
+    cut[3] = section[8] if down > 0.0 else 1.0 / section[8]
 
 
 @kernel
@@ -173,9 +199,12 @@ def _levels(profile: Array, low: int, high: int, c: float, cut: Array, a: Array,
     a[0, 0] += _SAME_PLATE
     a[3, 3] += _SAME_PLATE
     a[3, 0] -= _SAME_PLATE
-    a[1, 1] += _SAME_BAND
-    a[2, 2] += _SAME_BAND
-    a[2, 1] -= _SAME_BAND
+    # plate - second band = ratio (plate - first band)
+    ratio = cut[3]
+    share[0], share[1], share[2], share[3] = 1.0 - ratio, ratio, -1.0, 0.0
+    for i in range(4):
+        for j in range(i + 1):
+            a[i, j] += _SAME_RATIO * share[i] * share[j]
     misfit = 0.0
     for k in range(low, high):
         _pixel(k, c, cut, share, slope)
@@ -232,9 +261,7 @@ def _best_of(profile: Array, low: int, high: int, c: float, cut: Array) -> float
 
 
 @kernel
-def coarse_centre(
-    profile: Array, count: int, o: float, search: float, cut: Array, found: Array
-) -> bool:
+def coarse_centre(profile: Array, count: int, o: float, search: float, cut: Array, found: Array) -> bool:
     """Where a band of the section's width is darkest against the plate beside it.
 
     Args:
@@ -299,5 +326,3 @@ def band_centre(profile: Array, count: int, o: float, search: float, cut: Array,
     found[0], found[1] = c, np.sqrt(max(out[1], 0.0))
     dark = (level[1] * (cut[1] - cut[0]) + level[2] * (cut[2] - cut[1])) / (cut[2] - cut[0])
     return bool(0.5 * (level[0] + level[3]) > dark)
-
-

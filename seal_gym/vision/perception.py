@@ -109,7 +109,7 @@ def _taught_section(view: int, g: ViewGeometry, par: TrackNumbers, section: Arra
     d[1] = 1.0
     plate_axes(d, par.plate, n, m)
     p[2] = -g.stand_off[0] - _HOVER
-    return bool(section_of(p, d, n, m, view, g, par.groove_width_m, par.groove_depth_m, section))
+    return bool(section_of(p, d, n, m, view, g, par.groove, section))
 
 
 @kernel

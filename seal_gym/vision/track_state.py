@@ -10,7 +10,7 @@ from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.edges import EdgeCfg
-from seal_gym.vision.groove import GrooveCfg
+from seal_gym.vision.groove import NO_GROOVE, GrooveCfg
 from seal_gym.vision.seam_line import LineCfg
 
 Bools = NDArray[np.bool_]
@@ -89,7 +89,7 @@ class PerceptionCfg:
 
 
 class TrackNumbers(NamedTuple):
-    """``PerceptionCfg``'s numbers as the kernels take them, times in frames; the plate's normal; the groove."""
+    """``PerceptionCfg``'s numbers as the kernels take them, times in frames; plate and groove."""
 
     memory: float
     ahead_px: float
@@ -112,13 +112,10 @@ class TrackNumbers(NamedTuple):
     follow_gain: float
     velocity_gain: float
     plate: tuple[float, float, float]
-    groove_width_m: float
-    groove_depth_m: float
+    groove: tuple[float, float, float]
 
     @classmethod
-    def of(
-        cls, cfg: PerceptionCfg, frame_s: float, plate: Array, groove: GrooveCfg | None
-    ) -> "TrackNumbers":
+    def of(cls, cfg: PerceptionCfg, frame_s: float, plate: Array, groove: GrooveCfg | None) -> "TrackNumbers":
         """Takes the numbers from a configuration.
 
         Args:
@@ -142,8 +139,7 @@ class TrackNumbers(NamedTuple):
             coast=cfg.coast_s / frame_s + 1e-9,
             search=cfg.search_s / frame_s + 1e-9,
             plate=(x, y, z),
-            groove_width_m=groove.width_m if groove else 0.0,
-            groove_depth_m=groove.depth_m if groove else 0.0,
+            groove=groove.numbers if groove else NO_GROOVE,
         )
 
 

@@ -92,7 +92,7 @@ def track_front(
     line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
     plate_axes(d, par.plate, n, m)
     seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0 and _usual(i, 0, mask, line, par, state, s)
-    seen = seen and section_of(p, d, n, m, 0, g, par.groove_width_m, par.groove_depth_m, section)
+    seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
@@ -255,7 +255,7 @@ def track_side(
     plate_axes(d, par.plate, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
-    if not section_of(p, d, n, m, 1, g, par.groove_width_m, par.groove_depth_m, section):
+    if not section_of(p, d, n, m, 1, g, par.groove, section):
         return False
     if not _usual(i, 1, mask, line, par, state, s):
         return False

@@ -7,7 +7,17 @@ from seal_gym.core.cell import load_cell
 from seal_gym.core.errors import ConfigError
 from seal_gym.vision.edges import EdgeStage
 from seal_gym.vision.features import ViewGeometry
-from seal_gym.vision.groove import NO_SECTION, SECTION, GrooveCfg, band_centre, coarse_centre, cuts_at, section_of
+from seal_gym.vision.groove import (
+    CUTS,
+    NO_GROOVE,
+    NO_SECTION,
+    SECTION,
+    GrooveCfg,
+    band_centre,
+    coarse_centre,
+    cuts_at,
+    section_of,
+)
 from seal_gym.vision.seam_line import LineCfg, follow, groove_line, row_edge
 from seal_gym.vision.strip_geometry import plate_axes, to_strip
 
@@ -22,8 +32,8 @@ def section_across(c, width, corner, levels, count=COUNT):
     return np.asarray(levels, float)[np.searchsorted(cuts, x)].reshape(count, FINE).mean(axis=1)
 
 
-def cut_of(width, corner):
-    return width * np.array([-0.5, corner - 0.5, 0.5])
+def cut_of(width, corner, ratio=0.45):
+    return np.append(width * np.array([-0.5, corner - 0.5, 0.5]), ratio)
 
 
 def centres(width, corner, levels, sigma, n=200):
@@ -63,7 +73,9 @@ def test_noise_leaves_what_the_step_says(width):
     """An edge of the step found has a standard deviation of noise over step."""
     sigma, found = 2.5, np.empty(2)
     error = centres(width, 0.62, (150, 40, 100, 150), sigma)
-    band_centre(section_across(20.0, width, 0.62, (150, 40, 100, 150)), COUNT, 20.0, 3.0, cut_of(width, 0.62), found)
+    band_centre(
+        section_across(20.0, width, 0.62, (150, 40, 100, 150)), COUNT, 20.0, 3.0, cut_of(width, 0.62), found
+    )
     assert abs(error.mean()) < 0.02
     assert error.std() == pytest.approx(sigma / found[1], rel=0.7)
 
@@ -99,7 +111,7 @@ def section(view, lean_deg, heading_deg, width, depth):
     d = np.cos(turn) * np.array([0.0, 1.0, 0.0]) + np.sin(turn) * right
     n, m, p, out = np.empty(3), np.empty(3), np.array([1e-4, 0.0, -3e-3]), np.empty(SECTION)
     plate_axes(d, tuple(normal), n, m)
-    assert section_of(p, d, n, m, view, VIEWS, width, depth, out)
+    assert section_of(p, d, n, m, view, VIEWS, (width, depth, 0.45), out)
     return p, d, n, m, out
 
 
@@ -119,11 +131,16 @@ def at_row(p, d, view, t):
 def test_the_cuts_are_the_projected_banks_and_the_visible_corner(view, lean, heading):
     width, depth = 2e-3, 2e-3
     p, d, n, m, out = section(view, lean, heading, width, depth)
-    a, b, cut = np.empty(2), np.empty(2), np.empty(3)
+    a, b, cut = np.empty(2), np.empty(2), np.empty(CUTS)
     to_strip(p, view, VIEWS, a)
     to_strip(p + 1e-5 * d, view, VIEWS, b)
     cuts_at(out, (b[1] - a[1]) / (b[0] - a[0]), cut)
-    lines = [p - width / 2 * m, p + width / 2 * m, p - width / 2 * m - depth * n, p + width / 2 * m - depth * n]
+    lines = [
+        p - width / 2 * m,
+        p + width / 2 * m,
+        p - width / 2 * m - depth * n,
+        p + width / 2 * m - depth * n,
+    ]
     left, right, low_left, low_right = (at_row(x, d, view, a[0]) - a[1] for x in lines)
     assert cut[[0, 2]] == pytest.approx([left, right], abs=0.15)
     # Of the two walls the camera sees the one whose foot is inside the opening.
@@ -136,7 +153,7 @@ def test_on_a_bend_the_banks_are_parallel_to_the_local_direction():
     for view in (0, 1):
         p, _, _, _, straight = section(view, 0.0, 0.0, 2e-3, 2e-3)
         _, d, _, _, turned = section(view, 0.0, 25.0, 2e-3, 2e-3)
-        a, b, one, other = np.empty(2), np.empty(2), np.empty(3), np.empty(3)
+        a, b, one, other = np.empty(2), np.empty(2), np.empty(CUTS), np.empty(CUTS)
         to_strip(p, view, VIEWS, a)
         to_strip(p + 1e-5 * d, view, VIEWS, b)
         q = (b[1] - a[1]) / (b[0] - a[0])
@@ -146,7 +163,7 @@ def test_on_a_bend_the_banks_are_parallel_to_the_local_direction():
 
 
 HEIGHT, WIDTH, T_REF = 100, 50, 25.4
-PLAIN_SECTION = np.array([1e-3, 0.0, 3000.0, 0.0, 0.0, 3000.0, 0.0, 0.0])  # 6 px wide
+PLAIN_SECTION = np.array([1e-3, 0.0, 3000.0, 0.0, 0.0, 3000.0, 0.0, 0.0, 0.45])  # 6 px wide
 LINE = LineCfg().numbers
 
 
@@ -202,7 +219,7 @@ def test_the_nozzle_over_the_groove_hides_it():
 
 def test_a_seam_without_a_groove_has_no_section():
     p, d, n, m, out = *(np.zeros(3) for _ in range(4)), np.ones(SECTION)
-    assert section_of(p, d, n, m, 0, VIEWS, 0.0, 0.0, out)
+    assert section_of(p, d, n, m, 0, VIEWS, NO_GROOVE, out)
     np.testing.assert_array_equal(out, NO_SECTION)
 
 
