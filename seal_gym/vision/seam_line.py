@@ -235,16 +235,13 @@ def _allowed(mask: Mask, edge: Mask, row: int, column: int) -> bool:
 
 
 @kernel
-def _groove_allowed(mask: Mask, edge: Mask, row: int, o: float, cut: Array) -> bool:
-    """Whether the nozzle hides nothing of groove and banks, and the edge stage found one of them."""
-    width = edge.shape[1]
+def _bank_seen(edge: Mask, row: int, o: float, cut: Array) -> bool:
+    """Whether the edge stage found one of the banks."""
     seen = False
-    left, right = o + cut[0], o + cut[2]
-    for x in range(max(int(left) - PLATE_FLANK, 0), min(int(right) + PLATE_FLANK + 1, width)):
-        if mask[row, x]:
-            return False
-        near = min(abs(x + 0.5 - left), abs(x + 0.5 - right)) < 2.0
-        seen = seen or (near and edge[row, x])
+    for side in range(0, 3, 2):
+        bank = int(np.floor(o + cut[side]))
+        for x in range(max(bank - 1, 0), min(bank + 2, edge.shape[1])):
+            seen = seen or edge[row, x]
     return bool(seen)
 
 
@@ -272,7 +269,14 @@ def _row_groove(
     middle = int(np.floor(o + 0.5))
     # So far from the border that all of a profile's rows, sheared, are in the strip.
     border = int(_HALF_ROWS * abs(q)) + 1
-    first, last = max(middle - half, border), min(middle + half, width - border)
+    if not border <= middle < width - border:
+        return False
+    # The nozzle may hide a bank, not the middle.
+    first = last = middle
+    while first > max(middle - half, border) and not mask[row, first - 1]:
+        first -= 1
+    while last < min(middle + half, width - border) and not mask[row, last]:
+        last += 1
     count = last - first
     if count < 2 * _FLANK or not _profile(grey, row, q, first, count, 1.0, profile):
         return False
@@ -281,7 +285,7 @@ def _row_groove(
     found[0] += first
     if found[1] < par.min_contrast or abs(found[0] - o) > search + 1.0:
         return False
-    return bool(_groove_allowed(mask, edge, row, found[0], cut))
+    return bool(_bank_seen(edge, row, found[0], cut))
 
 
 @kernel
@@ -602,7 +606,7 @@ def groove_line(
         if not coarse_centre(profile, count, 0.5 * count, 0.5 * count, cut, found):
             continue
         o[n] = left + found[0]
-        if found[1] < par.min_contrast or not _groove_allowed(mask, edge, row, o[n], cut):
+        if found[1] < par.min_contrast or not _bank_seen(edge, row, o[n], cut):
             continue
         t[n] = row + 0.5 - t_ref
         vote[n] = found[1] / (1.0 + (t[n] / par.reach_px) ** 2)

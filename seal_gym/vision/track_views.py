@@ -17,6 +17,9 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
+# From above a plate the side view answers to a bend four times as much as in a fillet: its far rows are the
+# less sure, as the root, because a bend's error grows with the square of the way.
+_GROOVE_REACH = 0.5
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
 
@@ -191,6 +194,7 @@ def _side_residual(
     # Above the plate the seam may come into the ROI only ahead of the tip.
     below = line[1] - (mask.shape[1] - _HIDDEN)
     skip = min(-below / line[2], float(mask.shape[0])) if below > 0.0 and line[2] < -1e-3 else 0.0
+    reach = _GROOVE_REACH * par.side_px if section[0] > 0.0 else par.side_px
     first = int(line[0] + skip - par.side_px)
     for row in range(first, int(line[0] + skip + par.side_px) + 1):
         t = row + 0.5 - line[0]
@@ -209,7 +213,7 @@ def _side_residual(
             continue
         error = found[0] - b[1]
         # Far rows hang on the curve's bend, which is less sure.
-        w = found[1] * found[1] / (1.0 + (2.0 * (t - skip) / par.side_px) ** 4)
+        w = found[1] * found[1] / (1.0 + (2.0 * (t - skip) / reach) ** 4)
         s0 += w
         s1 += w * t
         s2 += w * t * t

@@ -88,12 +88,15 @@ def test_one_bank_out_of_the_picture_is_enough():
         assert found[0] == pytest.approx(c, abs=0.03)
 
 
-def test_a_wrong_width_leaves_the_middle_where_it_is():
-    found = np.empty(2)
-    profile = section_across(20.2, 6.0, 1.0, (150, 60, 60, 150))
-    for width in (5.4, 6.6):
+@pytest.mark.parametrize("width", [5.4, 6.6])
+def test_a_wrong_width_leaves_the_middle_where_it_is(width):
+    """By symmetry; a place in a pixel may be a fifth of one off, their mean is not."""
+    found, error = np.empty(2), []
+    for c in np.linspace(19.5, 20.5, 21):
+        profile = section_across(c, 6.0, 1.0, (150, 60, 60, 150))
         assert band_centre(profile, COUNT, 20.0, 3.0, cut_of(width, 1.0), found)
-        assert found[0] == pytest.approx(20.2, abs=0.1)
+        error.append(found[0] - c)
+    assert abs(np.mean(error)) < 0.02 and np.abs(error).max() < 0.25
 
 
 def test_a_ridge_or_nothing_is_no_groove():
@@ -143,9 +146,13 @@ def test_the_cuts_are_the_projected_banks_and_the_visible_corner(view, lean, hea
     ]
     left, right, low_left, low_right = (at_row(x, d, view, a[0]) - a[1] for x in lines)
     assert cut[[0, 2]] == pytest.approx([left, right], abs=0.15)
-    # Of the two walls the camera sees the one whose foot is inside the opening.
-    seen = min(low_left, right) if low_left > left else max(low_right, left)
-    assert cut[1] == pytest.approx(seen, abs=0.2)
+    # Of the two walls the camera sees the one whose foot is inside the opening, by more than perspective.
+    if low_left > left + 0.3:
+        assert cut[1] == pytest.approx(min(low_left, right), abs=0.2) and cut[3] == 0.45
+    elif low_right < right - 0.3:
+        assert cut[1] == pytest.approx(max(low_right, left), abs=0.2) and cut[3] == 1 / 0.45
+    else:
+        assert min(abs(cut[1] - left), abs(cut[1] - right)) < 0.3
 
 
 def test_on_a_bend_the_banks_are_parallel_to_the_local_direction():
@@ -209,12 +216,15 @@ def test_a_groove_is_followed_round_a_bend(bend):
     assert abs(error.mean()) < 0.06 and error.std() < 0.25
 
 
-def test_the_nozzle_over_the_groove_hides_it():
-    grey, mask, edge = strip(lambda t: 25.0 + 0 * t, 1)
-    mask[:, 27:] = True
+def test_the_nozzle_may_hide_a_bank_but_not_the_middle():
+    grey, mask, edge = strip(lambda t: 25.2 + 0 * t, 1)
+    grey[:, 27:] = 60  # darker than the floor
+    mask[:, 25:] = True  # with the margin
     found = np.empty(2)
-    assert row_edge(grey, ~mask & mask, edge, 40, 25.0, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
-    assert not row_edge(grey, mask, edge, 40, 25.0, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
+    assert not row_edge(grey, mask, edge, 40, 25.2, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
+    mask[:, 25] = False
+    assert row_edge(grey, mask, edge, 40, 25.2, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
+    assert found[0] == pytest.approx(25.2, abs=0.5)
 
 
 def test_a_seam_without_a_groove_has_no_section():
