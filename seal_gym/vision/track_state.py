@@ -17,6 +17,7 @@ Bools = NDArray[np.bool_]
 
 MIN_ROWS = 8  # with an edge, for a view to count as seen
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
+_PLANE = 0.3  # share of the drift of a fillet's floor that a groove's plane has: it never climbs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +131,9 @@ class TrackNumbers(NamedTuple):
         pairs = ("level_change", "level_step")
         names = [n for n in cls._fields if hasattr(cfg, n) and n not in pairs]
         same = {name: float(getattr(cfg, name)) for name in names}
+        if groove:
+            same["height_q_m"] *= _PLANE
+            same["pitch_q_rad"] *= _PLANE
         x, y, z = (float(v) for v in plate)
         return cls(
             **same,

@@ -18,8 +18,10 @@ _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
 # From above a plate the side view answers to a bend four times as much as in a fillet: its far rows are the
-# less sure, as the root, because a bend's error grows with the square of the way.
+# less sure, as the root, because a bend's error grows with the square of the way. And the bend is known to
+# about this share, which this far from the tip looks like a change of the plane's height and pitch.
 _GROOVE_REACH = 0.5
+_BEND_SHARE, _BEND_M = 0.3, 2.5 * _MM
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
 
@@ -269,6 +271,9 @@ def track_side(
     noise = 5.0 * par.row_sigma_m**2
     r_height = noise * out[2] + _HEIGHT_FLOOR**2
     r_pitch = noise * out[3] * per_m[0] ** 2 + _PITCH_FLOOR**2
+    if section[0] > 0.0:
+        r_height += (_BEND_SHARE * bend * _BEND_M * _BEND_M) ** 2
+        r_pitch += (2.0 * _BEND_SHARE * bend * _BEND_M) ** 2
     variance = state.variance[i]
     height = _kalman(variance, 0, par.height_q_m, out[0] / per_m[1], r_height, par.gate)
     if height == 0.0:
