@@ -57,6 +57,8 @@ _HOVER = 9.5e-3  # that the gun starts further away by, about [m]
 _FINE_PX, _COARSE_PX = 0.3, 1.5  # how sure an edge of the first line is
 _START_SLOPE = 0.07  # of the side view's line as the gun is put before the seam
 _HEIGHT_START, _PITCH_START = 0.2e-3, 0.03  # of its first tangent [m], [rad]
+# A plate seen from above: on a bend the side view's line says little of its height and pitch.
+_GROOVE_HEIGHT_START, _GROOVE_PITCH_START = 1e-3, 0.1
 
 
 @kernel
@@ -294,6 +296,8 @@ def _start(
     state.tracking[i] = True
     state.variance[i, 0] = (_HEIGHT_START * sigma / _FINE_PX) ** 2
     state.variance[i, 1] = _PITCH_START**2
+    if section[0] > 0.0:
+        state.variance[i, 0], state.variance[i, 1] = _GROOVE_HEIGHT_START**2, _GROOVE_PITCH_START**2
     return True
 
 

@@ -29,6 +29,7 @@ _HALF_PROFILE = 31  # of what a profile holds
 # Where a bend's seam crosses the rows aslant, the middle between the banks along a row is off the seam: by
 # h^2 q^2 sqrt(1 + q^2) / 2R with half the width h, 0.08 mm at this slope in a groove of 2 mm round 5 mm.
 _STEEPEST = 0.8
+NARROW_PX = 4.0  # of a groove this wide or wider one bank is enough
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
@@ -246,6 +247,37 @@ def _bank_seen(edge: Mask, row: int, o: float, cut: Array) -> bool:
 
 
 @kernel
+def _free_stretch(mask: Mask, row: int, middle: int, half: int, border: int) -> tuple[int, int]:
+    """First and last + 1 column round the middle that the nozzle leaves free; the same if there is none."""
+    low, high = max(middle - half, border), min(middle + half, mask.shape[1] - border)
+    first = last = middle
+    if not low <= middle <= high:
+        return first, last
+    while first > low and not mask[row, first - 1]:
+        first -= 1
+    while last < high and not mask[row, last]:
+        last += 1
+    # The profile's outer rows reach beyond the mask's margin.
+    if first > low:
+        first += 1
+    if last < high:
+        last -= 1
+    return first, last
+
+
+@kernel
+def _covered(mask: Mask, row: int, o: float, cut: Array) -> bool:
+    """Whether the nozzle hides a bank that is needed: a groove of a few pixels has to show both."""
+    if cut[2] - cut[0] >= NARROW_PX:
+        return False
+    first, last = int(o + cut[0]) - PLATE_FLANK, int(o + cut[2]) + PLATE_FLANK + 1
+    covered = False
+    for x in range(max(first, 0), min(last, mask.shape[1])):
+        covered = covered or mask[row, x]
+    return bool(covered)
+
+
+@kernel
 def _row_groove(
     grey: Grey,
     mask: Mask,
@@ -262,21 +294,12 @@ def _row_groove(
     """``row_edge`` of a groove: its middle."""
     if abs(q) > _STEEPEST:
         return False
-    width = grey.shape[1]
     cut = np.empty(CUTS)
     cuts_at(section, q, cut)
     half = min(int(search + cut[2]) + PLATE_FLANK + 2, _HALF_PROFILE)
-    middle = int(np.floor(o + 0.5))
     # So far from the border that all of a profile's rows, sheared, are in the strip.
     border = int(_HALF_ROWS * abs(q)) + 1
-    if not border <= middle < width - border:
-        return False
-    # The nozzle may hide a bank, not the middle.
-    first = last = middle
-    while first > max(middle - half, border) and not mask[row, first - 1]:
-        first -= 1
-    while last < min(middle + half, width - border) and not mask[row, last]:
-        last += 1
+    first, last = _free_stretch(mask, row, int(np.floor(o + 0.5)), half, border)
     count = last - first
     if count < 2 * _FLANK or not _profile(grey, row, q, first, count, 1.0, profile):
         return False
@@ -285,7 +308,7 @@ def _row_groove(
     found[0] += first
     if found[1] < par.min_contrast or abs(found[0] - o) > search + 1.0:
         return False
-    return bool(_bank_seen(edge, row, found[0], cut))
+    return bool(_bank_seen(edge, row, found[0], cut) and not _covered(mask, row, found[0], cut))
 
 
 @kernel

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
-from seal_gym.vision.groove import SECTION, section_of
-from seal_gym.vision.seam_line import LineNumbers, follow, row_edge
+from seal_gym.vision.groove import CUTS, SECTION, cuts_at, section_of
+from seal_gym.vision.seam_line import NARROW_PX, LineNumbers, follow, row_edge
 from seal_gym.vision.seam_memory import fit_memory, remember
 from seal_gym.vision.strip_geometry import normalise, plate_axes, strip_slope, to_strip
 from seal_gym.vision.track_state import MIN_ROWS, Scratch, TrackNumbers, TrackState
@@ -171,6 +171,17 @@ def _side_frame(
 
 
 @kernel
+def _reach(section: Array, q: float, par: TrackNumbers) -> float:
+    """How far from the tip the side view's rows count fully, twice [px]."""
+    if section[0] <= 0.0:
+        return par.side_px
+    cut = np.empty(CUTS)
+    cuts_at(section, q, cut)
+    # A narrow groove needs far rows: those near the tip are under the nozzle, and all cut the same pixels.
+    return par.side_px * (_GROOVE_REACH if cut[2] - cut[0] >= NARROW_PX else 1.0)
+
+
+@kernel
 def _side_residual(
     mask: Bools,
     g: ViewGeometry,
@@ -196,7 +207,7 @@ def _side_residual(
     # Above the plate the seam may come into the ROI only ahead of the tip.
     below = line[1] - (mask.shape[1] - _HIDDEN)
     skip = min(-below / line[2], float(mask.shape[0])) if below > 0.0 and line[2] < -1e-3 else 0.0
-    reach = _GROOVE_REACH * par.side_px if section[0] > 0.0 else par.side_px
+    reach = _reach(section, line[2], par)
     first = int(line[0] + skip - par.side_px)
     for row in range(first, int(line[0] + skip + par.side_px) + 1):
         t = row + 0.5 - line[0]
