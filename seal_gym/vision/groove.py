@@ -34,7 +34,6 @@ SECTION, CUTS = 9, 4  # numbers of a section, see ``section_of``, and of its cut
 NO_SECTION = np.zeros(SECTION)
 FLANK = 4  # pixels of the plate on either side that give its grey level
 
-_LEAST_PX = 1.5  # of a band that have to be in the profile
 _GRID, _GRID_PX = 8, 0.125
 _TURNS = 3
 _LONGEST_PX = 0.25  # step
@@ -290,7 +289,7 @@ def coarse_centre(profile: Array, count: int, o: float, search: float, cut: Arra
             beside = 1.0 - w if left - FLANK < k + 0.5 < right + FLANK else 0.0
             outside += beside * profile[k]
             n_out += beside
-        if n_in < min(0.5 * (right - left), _LEAST_PX) or n_out < FLANK - 1.0:
+        if n_in < 0.5 * (right - left) or n_out < FLANK - 1.0:
             continue
         score = outside / n_out - inside / n_in
         if score > found[1]:

@@ -29,6 +29,7 @@ _HALF_PROFILE = 31  # of what a profile holds
 # Where a bend's seam crosses the rows aslant, the middle between the banks along a row is off the seam: by
 # h^2 q^2 sqrt(1 + q^2) / 2R with half the width h, 0.08 mm at this slope in a groove of 2 mm round 5 mm.
 _STEEPEST = 0.8
+_LEAST_BESIDE_PX = 0.5
 NARROW_PX = 4.0  # of a groove this wide or wider one bank is enough
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -301,7 +302,10 @@ def _row_groove(
     border = int(_HALF_ROWS * abs(q)) + 1
     first, last = _free_stretch(mask, row, int(np.floor(o + 0.5)), half, border)
     count = last - first
-    if count < 2 * _FLANK or not _profile(grey, row, q, first, count, 1.0, profile):
+    # A bank may be hidden, the middle may not.
+    if count < 2 * _FLANK or abs(o - 0.5 * (first + last)) > 0.5 * count - _LEAST_BESIDE_PX:
+        return False
+    if not _profile(grey, row, q, first, count, 1.0, profile):
         return False
     if not band_centre(profile, count, o - first, search, cut, found):
         return False

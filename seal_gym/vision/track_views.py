@@ -27,8 +27,25 @@ _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no bett
 
 
 @kernel
+def _half_width(section: Array, q: float) -> float:
+    """Of a groove in a row [px]; 0 of an edge."""
+    if section[0] <= 0.0:
+        return 0.0
+    cut = np.empty(CUTS)
+    cuts_at(section, q, cut)
+    return cut[2]
+
+
+@kernel
 def _usual(
-    i: int, view: int, mask: Bools, line: Array, par: TrackNumbers, state: TrackState, s: Scratch
+    i: int,
+    view: int,
+    mask: Bools,
+    line: Array,
+    section: Array,
+    par: TrackNumbers,
+    state: TrackState,
+    s: Scratch,
 ) -> bool:
     """Whether plate and wall beside the expected line are as bright as they usually are.
 
@@ -40,12 +57,13 @@ def _usual(
     usual = steady = True
     trust = 1.0 if state.steady[i, view] >= _SETTLED else 0.7
     fresh = np.empty(2)
+    half = _half_width(section, line[2])
     # In the side view the wall changes too much at corners; the height's gate guards it.
     for side in range(view, 2):
         total, count = 0.0, 0
         for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
             o = line[1] + line[2] * (row + 0.5 - line[0])
-            first = int(o) + 2 if side == 1 else int(o) - 1 - _BESIDE
+            first = int(o + half) + 2 if side == 1 else int(o - half) - 1 - _BESIDE
             for x in range(max(first, 0), min(first + _BESIDE, width)):
                 if not mask[row, x]:
                     total += s.grey[row, x]
@@ -96,8 +114,9 @@ def track_front(
     """
     line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
     plate_axes(d, par.plate, n, m)
-    seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0 and _usual(i, 0, mask, line, par, state, s)
+    seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0
     seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
+    seen = seen and _usual(i, 0, mask, line, section, par, state, s)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
@@ -175,10 +194,8 @@ def _reach(section: Array, q: float, par: TrackNumbers) -> float:
     """How far from the tip the side view's rows count fully, twice [px]."""
     if section[0] <= 0.0:
         return par.side_px
-    cut = np.empty(CUTS)
-    cuts_at(section, q, cut)
     # A narrow groove needs far rows: those near the tip are under the nozzle, and all cut the same pixels.
-    return par.side_px * (_GROOVE_REACH if cut[2] - cut[0] >= NARROW_PX else 1.0)
+    return par.side_px * (_GROOVE_REACH if 2.0 * _half_width(section, q) >= NARROW_PX else 1.0)
 
 
 @kernel
@@ -274,7 +291,7 @@ def track_side(
         return False
     if not section_of(p, d, n, m, 1, g, par.groove, section):
         return False
-    if not _usual(i, 1, mask, line, par, state, s):
+    if not _usual(i, 1, mask, line, section, par, state, s):
         return False
     if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return False

@@ -218,13 +218,14 @@ def test_a_groove_is_followed_round_a_bend(bend):
 
 def test_the_nozzle_may_hide_a_bank_but_not_the_middle():
     grey, mask, edge = strip(lambda t: 25.2 + 0 * t, 1)
-    grey[:, 27:] = 60  # darker than the floor
-    mask[:, 25:] = True  # with the margin
+    grey[:, 29:] = 60  # darker than the floor
+    mask[:, 25:] = True  # with its margin and more
     found = np.empty(2)
     assert not row_edge(grey, mask, edge, 40, 25.2, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
-    mask[:, 25] = False
-    assert row_edge(grey, mask, edge, 40, 25.2, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
-    assert found[0] == pytest.approx(25.2, abs=0.5)
+    mask[:, 25:27] = False
+    for row in range(10, 90, 7):
+        assert row_edge(grey, mask, edge, row, 25.0, 0.0, 3.0, PLAIN_SECTION, LINE, np.empty(64), found)
+        assert found[0] == pytest.approx(25.2, abs=0.5)
 
 
 def test_a_seam_without_a_groove_has_no_section():

@@ -115,11 +115,18 @@ def test_the_middle_of_a_groove_within_the_targets(part):
     assert (rms[:2] <= 0.2).all() and (rms[2:] <= 0.6).all()
 
 
-def test_a_fine_groove_within_half_a_pixel():
-    """It is 1.5 px wide: a wall and the floor share two pixels."""
-    error = run(Ride(groove(LINE, width=5e-4), range(4), 0.04), 50)[20:]
-    rms = np.sqrt((error**2).mean(axis=(0, 1)))
-    assert (rms[:2] <= 0.3).all() and (rms[2:] <= 1.0).all()
+def test_a_fine_groove_within_the_targets_where_it_is_seen():
+    """It is 1.5 px wide, and where the gun sways it comes under the nozzle in the side view."""
+    ride = Ride(groove(LINE, width=5e-4), range(4), 0.04)
+    eyes, errors = ride.perception(), []
+    for k in range(50):
+        images, tips, truth = ride.frame(k)
+        lines = eyes.update(images.front, images.side, tips)
+        if k >= 20 and lines.valid.all():
+            errors.append(ride.errors(lines, truth))
+    assert len(errors) >= 25
+    rms = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.2).all() and (rms[2:] <= 0.6).all()
 
 
 def test_rows_never_mix_and_runs_repeat():
