@@ -14,8 +14,8 @@ a seam at rest does not jump. Each frame then
 The front view fixes the seam in the plane, the side view fixes the plane. A view without the seam coasts on
 the tangent in the world for a while, then is invalid, and RANSAC looks for a new start.
 
-The seam of a fillet is an edge, that of a groove the middle of a dark band (``groove``), which is found in its
-place row by row; all else is the same, but that a groove's plane never climbs.
+The seam of a fillet is an edge, that of a groove the middle of a dark band (``groove``), found in each row in
+the edge's place. All else is the same, but that a groove's plane never climbs.
 """
 
 import numpy as np

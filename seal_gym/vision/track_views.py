@@ -33,7 +33,7 @@ def _half_width(section: Array, q: float) -> float:
         return 0.0
     cut = np.empty(CUTS)
     cuts_at(section, q, cut)
-    return cut[2]
+    return float(cut[2])
 
 
 @kernel
