@@ -23,7 +23,7 @@ from seal_gym.sim.scene import Scene, cached_scene
 from seal_gym.tasks.progress import Progress
 from seal_gym.tasks.reward import reward
 from seal_gym.vision.features import RoiFeatures, SeamLines, ViewGeometry, oracle_lines, update_features
-from seal_gym.vision.perception import Perception
+from seal_gym.vision.perception import GrooveCfg, Perception
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.seam import seam_in_world
 from seal_gym.wrappers.base import DisturbanceCfg
@@ -144,7 +144,7 @@ class SealCore:
         self.time_limit = int(np.ceil(task.time_factor * nominal_s * cell.timing.frame_rate_hz))
 
     def _eyes(self) -> Perception:
-        cfg = self.cfg
+        cfg, width = self.cfg, self.scene.workpiece.groove_width
         return Perception(
             self.n,
             self._views,
@@ -152,6 +152,7 @@ class SealCore:
             cfg.cell.timing.frame_s,
             cfg.vision,
             plate=self._start[2, :3],  # the part's z axis in the taught tip frame
+            groove=GrooveCfg(width_m=width, depth_m=width) if width else None,
             threads=cfg.threads,
         )
 

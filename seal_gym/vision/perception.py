@@ -13,6 +13,9 @@ a seam at rest does not jump. Each frame then
 
 The front view fixes the seam in the plane, the side view fixes the plane. A view without the seam coasts on
 the tangent in the world for a while, then is invalid, and RANSAC looks for a new start.
+
+The seam of a fillet is an edge, that of a groove the middle of a dark band (``groove``), found in each row in
+the edge's place. All else is the same, but that a groove's plane never climbs.
 """
 
 import numpy as np
@@ -24,8 +27,18 @@ from seal_gym.core.jit import kernel
 from seal_gym.core.parallel import split
 from seal_gym.vision.edges import EdgeDetector, EdgeTables, edge_image
 from seal_gym.vision.features import SeamLines, ViewGeometry
-from seal_gym.vision.seam_line import LineNumbers, dilated, follow, local_line, ransac_line, strips
-from seal_gym.vision.strip_geometry import nearest_point, project_tangent, triangulate
+from seal_gym.vision.groove import SECTION, GrooveCfg, section_of
+from seal_gym.vision.seam_line import (
+    LineNumbers,
+    dilated,
+    follow,
+    groove_line,
+    local_line,
+    ransac_line,
+    row_edge,
+    strips,
+)
+from seal_gym.vision.strip_geometry import nearest_point, plate_axes, project_tangent, triangulate
 from seal_gym.vision.track_state import (
     OWN_EDGES,
     EdgeMaps,
@@ -37,15 +50,18 @@ from seal_gym.vision.track_state import (
 )
 from seal_gym.vision.track_views import learn_levels, track_front, track_side
 
-__all__ = ["Perception", "PerceptionCfg"]
+__all__ = ["GrooveCfg", "Perception", "PerceptionCfg"]
 
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 _FILLET_PLATE = np.array([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+_HOVER = 9.5e-3  # that the gun starts further away by, about [m]
 _FINE_PX, _COARSE_PX = 0.3, 1.5  # how sure an edge of the first line is
 _START_SLOPE = 0.07  # of the side view's line as the gun is put before the seam
 _HEIGHT_START, _PITCH_START = 0.2e-3, 0.03  # of its first tangent [m], [rad]
+# A plate seen from above: on a bend the side view's line says little of its height and pitch.
+_GROOVE_HEIGHT_START, _GROOVE_PITCH_START = 1e-3, 0.1
 
 
 @kernel
@@ -92,16 +108,51 @@ def _edges_of(
 
 
 @kernel
-def _search(view: int, mask: Bools, ref: Array, lp: LineNumbers, s: Scratch, line: Array) -> float:
+def _taught_section(view: int, g: ViewGeometry, par: TrackNumbers, section: Array) -> bool:
+    """The groove as a gun sees it that is held as taught, not as close yet as it will be."""
+    p, d, n, m = np.zeros(3), np.zeros(3), np.empty(3), np.empty(3)
+    d[1] = 1.0
+    plate_axes(d, par.plate, n, m)
+    p[2] = -g.stand_off[0] - _HOVER
+    return bool(section_of(p, d, n, m, view, g, par.groove, section))
+
+
+@kernel
+def _search(
+    view: int,
+    mask: Bools,
+    ref: Array,
+    g: ViewGeometry,
+    lp: LineNumbers,
+    par: TrackNumbers,
+    s: Scratch,
+    line: Array,
+) -> float:
     """A line (p, q) without knowing where to look; returns how sure a row's edge is [px], 0 without a line.
 
     Where the seam only grazes the ROI, RANSAC's line has to do: the view widens as the gun comes closer.
     """
-    raw = np.empty(2)
-    if not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], lp, raw):
+    raw, section = np.empty(2), np.empty(SECTION)
+    if not _taught_section(view, g, par, section):
+        return 0.0
+    if section[0] > 0.0:
+        if not groove_line(s.grey, mask, s.edge, ref[0], section, lp, s.profile, raw):
+            return 0.0
+    elif not ransac_line(s.edge, mask, s.intensity, s.ex, s.ey, ref[0], lp, raw):
         return 0.0
     n = follow(
-        s.grey, mask, s.edge, ref[0], raw[0], raw[1], lp.window_px, lp.window_px, lp, s.profile, s.points
+        s.grey,
+        mask,
+        s.edge,
+        ref[0],
+        raw[0],
+        raw[1],
+        lp.window_px,
+        lp.window_px,
+        section,
+        lp,
+        s.profile,
+        s.points,
     )
     if local_line(s.points, n, ref[0], ref[1], raw[0], lp, s.columns, line) > 0.0:
         return _FINE_PX
@@ -130,6 +181,25 @@ def _support(mask: Bools, t_ref: float, line: Array, lp: LineNumbers, s: Scratch
     out[1] = n
     out[2] = s2 - s1 * out[0]
     out[3] = lp.bright_side * step / (3.0 * max(n, 1.0))
+
+
+@kernel
+def _groove_support(
+    mask: Bools, t_ref: float, line: Array, section: Array, lp: LineNumbers, s: Scratch, out: Array
+) -> None:
+    """``_support`` of a groove: rows with one on the line."""
+    found = np.empty(2)
+    n = s1 = s2 = step = 0.0
+    for row in range(s.edge.shape[0]):
+        t = row + 0.5 - t_ref
+        o = line[0] + line[1] * t
+        if row_edge(s.grey, mask, s.edge, row, o, line[1], lp.inlier_px, section, lp, s.profile, found):
+            n += 1.0
+            s1 += t
+            s2 += t * t
+            step += found[1]
+    out[0], out[1] = s1 / max(n, 1.0), n
+    out[2], out[3] = s2 - s1 * out[0], step / max(n, 1.0)
 
 
 @kernel
@@ -193,22 +263,28 @@ def _start(
     e: EdgeTables,
     maps: EdgeMaps,
     lp: LineNumbers,
+    par: TrackNumbers,
     state: TrackState,
     s: Scratch,
     p: Array,
     d: Array,
 ) -> bool:
     """Looks for a seam that is not tracked; False if the views show none, and all stays as it was."""
-    line, lines, support = np.empty(3), np.empty((2, 3)), np.empty(4)
+    line, lines, support, section = np.empty(3), np.empty((2, 3)), np.empty(4), np.empty(SECTION)
     _edges_of(i, front, 0, mask_front, e, maps, s)
-    if _search(0, mask_front, ref[0], lp, s, line) <= 0.0:
+    if _search(0, mask_front, ref[0], g, lp, par, s, line) <= 0.0:
         return False
     lines[0] = line
     _edges_of(i, side, 1, mask_side, e, maps, s)
-    sigma = _search(1, mask_side, ref[1], lp, s, line)
+    sigma = _search(1, mask_side, ref[1], g, lp, par, s, line)
     if sigma <= 0.0:
         return False
-    _support(mask_side, ref[1, 0], line, lp, s, support)
+    if not _taught_section(1, g, par, section):
+        return False
+    if section[0] > 0.0:
+        _groove_support(mask_side, ref[1, 0], line, section, lp, s, support)
+    else:
+        _support(mask_side, ref[1, 0], line, lp, s, support)
     if support[1] < lp.min_points or support[3] < lp.min_contrast:
         return False
     # A short line's slope says little: the gun is known to start nearly as taught.
@@ -223,6 +299,8 @@ def _start(
     state.tracking[i] = True
     state.variance[i, 0] = (_HEIGHT_START * sigma / _FINE_PX) ** 2
     state.variance[i, 1] = _PITCH_START**2
+    if section[0] > 0.0:
+        state.variance[i, 0], state.variance[i, 1] = _GROOVE_HEIGHT_START**2, _GROOVE_PITCH_START**2
     return True
 
 
@@ -260,7 +338,21 @@ def _perceive(
             )
         if not found:
             found = _start(
-                i, front[i], side[i], mask_front, mask_side, ref, g, e, maps, lp, state, s, fresh_p, fresh_d
+                i,
+                front[i],
+                side[i],
+                mask_front,
+                mask_side,
+                ref,
+                g,
+                e,
+                maps,
+                lp,
+                par,
+                state,
+                s,
+                fresh_p,
+                fresh_d,
             )
             if found:
                 p[:], d[:] = fresh_p, fresh_d
@@ -288,6 +380,7 @@ class Perception:
         cfg: Parameters.
         plate: Normal of the plate in the tip frame of a gun held as taught, shape (3,); by default a nozzle
             that halves the right angle between the plate and a wall on the left.
+        groove: The seam's section, if the seam is the middle of a groove and not the foot of a wall.
         detector: Finds the edges in place of the fractional-order stage.
         threads: Splits the batch; the lines are the same for any number.
     """
@@ -301,6 +394,7 @@ class Perception:
         cfg: PerceptionCfg | None = None,
         *,
         plate: Array | None = None,
+        groove: GrooveCfg | None = None,
         detector: EdgeDetector | None = None,
         threads: int = 1,
     ) -> None:
@@ -317,9 +411,10 @@ class Perception:
         self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
         self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.numbers
         plate = _FILLET_PLATE if plate is None else plate
-        self._par = TrackNumbers.of(cfg, frame_s, plate)
-        # With the wall on the right the seam's dark and bright sides change places in both views.
-        self._negative = bool(plate[0] > 1e-6)
+        self._par = TrackNumbers.of(cfg, frame_s, plate, groove)
+        # With the wall on the right the seam's dark and bright sides change places in both views. A
+        # groove is dark whichever way the gun leans.
+        self._negative = bool(plate[0] > 1e-6) and groove is None
         rays = (int(self._par.memory) + 1) * (int(cfg.ahead_px) + 1)
         self._state = TrackState(
             point=np.zeros((n, 3)),

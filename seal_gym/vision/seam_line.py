@@ -15,6 +15,8 @@ from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.edges import EdgeDetector, grey_sum
+from seal_gym.vision.groove import CUTS, NO_SECTION, band_centre, coarse_centre, cuts_at
+from seal_gym.vision.groove import FLANK as PLATE_FLANK
 
 Grey = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -23,6 +25,12 @@ _HALF_ROWS = 2  # a row's profile is the mean of five rows along the edge
 _FLANK = 3  # pixels on either side that give the two grey levels
 _GAP = 3  # rows without an edge that a chain passes over
 _MAX_POINTS = 1024
+_HALF_PROFILE = 31  # of what a profile holds
+# Where a bend's seam crosses the rows aslant, the middle between the banks along a row is off the seam: by
+# h^2 q^2 sqrt(1 + q^2) / 2R with half the width h, 0.08 mm at this slope in a groove of 2 mm round 5 mm.
+_STEEPEST = 0.8
+_LEAST_BESIDE_PX = 0.5
+NARROW_PX = 4.0  # of a groove this wide or wider one bank is enough
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
@@ -229,6 +237,85 @@ def _allowed(mask: Mask, edge: Mask, row: int, column: int) -> bool:
 
 
 @kernel
+def _bank_seen(edge: Mask, row: int, o: float, cut: Array) -> bool:
+    """Whether the edge stage found one of the banks."""
+    seen = False
+    for side in range(0, 3, 2):
+        bank = int(np.floor(o + cut[side]))
+        for x in range(max(bank - 1, 0), min(bank + 2, edge.shape[1])):
+            seen = seen or edge[row, x]
+    return bool(seen)
+
+
+@kernel
+def _free_stretch(mask: Mask, row: int, middle: int, half: int, border: int) -> tuple[int, int]:
+    """First and last + 1 column round the middle that the nozzle leaves free; the same if there is none."""
+    low, high = max(middle - half, border), min(middle + half, mask.shape[1] - border)
+    first = last = middle
+    if not low <= middle <= high:
+        return first, last
+    while first > low and not mask[row, first - 1]:
+        first -= 1
+    while last < high and not mask[row, last]:
+        last += 1
+    # The profile's outer rows reach beyond the mask's margin.
+    if first > low:
+        first += 1
+    if last < high:
+        last -= 1
+    return first, last
+
+
+@kernel
+def _covered(mask: Mask, row: int, o: float, cut: Array) -> bool:
+    """Whether the nozzle hides a bank that is needed: a groove of a few pixels has to show both."""
+    if cut[2] - cut[0] >= NARROW_PX:
+        return False
+    first, last = int(o + cut[0]) - PLATE_FLANK, int(o + cut[2]) + PLATE_FLANK + 1
+    covered = False
+    for x in range(max(first, 0), min(last, mask.shape[1])):
+        covered = covered or mask[row, x]
+    return bool(covered)
+
+
+@kernel
+def _row_groove(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    row: int,
+    o: float,
+    q: float,
+    search: float,
+    section: Array,
+    par: LineNumbers,
+    profile: Array,
+    found: Array,
+) -> bool:
+    """``row_edge`` of a groove: its middle."""
+    if abs(q) > _STEEPEST:
+        return False
+    cut = np.empty(CUTS)
+    cuts_at(section, q, cut)
+    half = min(int(search + cut[2]) + PLATE_FLANK + 2, _HALF_PROFILE)
+    # So far from the border that all of a profile's rows, sheared, are in the strip.
+    border = int(_HALF_ROWS * abs(q)) + 1
+    first, last = _free_stretch(mask, row, int(np.floor(o + 0.5)), half, border)
+    count = last - first
+    # A bank may be hidden, the middle may not.
+    if count < 2 * _FLANK or abs(o - 0.5 * (first + last)) > 0.5 * count - _LEAST_BESIDE_PX:
+        return False
+    if not _profile(grey, row, q, first, count, 1.0, profile):
+        return False
+    if not band_centre(profile, count, o - first, search, cut, found):
+        return False
+    found[0] += first
+    if found[1] < par.min_contrast or abs(found[0] - o) > search + 1.0:
+        return False
+    return bool(_bank_seen(edge, row, found[0], cut) and not _covered(mask, row, found[0], cut))
+
+
+@kernel
 def row_edge(
     grey: Grey,
     mask: Mask,
@@ -237,11 +324,12 @@ def row_edge(
     o: float,
     q: float,
     search: float,
+    section: Array,
     par: LineNumbers,
     profile: Array,
     found: Array,
 ) -> bool:
-    """The edge near its expected place in a row, to a fraction of a pixel.
+    """The edge, or a groove's middle, near its expected place in a row, to a fraction of a pixel.
 
     Args:
         grey: The strip's sum of channels.
@@ -251,8 +339,9 @@ def row_edge(
         o: Where the edge is expected in it.
         q: The edge's slope: the profile is a mean along it.
         search: How far from there [px].
+        section: Of the groove; ``NO_SECTION`` for an edge.
         par: ``LineCfg.numbers``.
-        profile: Scratch, at least 32 long.
+        profile: Scratch, at least 64 long.
         found: Filled with the place [px] and the step [grey levels].
 
     Returns:
@@ -261,6 +350,8 @@ def row_edge(
     height, width = grey.shape
     if row < 0 or row >= height or not abs(o) < 2.0 * width:
         return False
+    if section[0] > 0.0:
+        return bool(_row_groove(grey, mask, edge, row, o, q, search, section, par, profile, found))
     half = int(search) + 1 + _FLANK
     middle = int(np.floor(o + 0.5))  # a boundary between the pixels middle - 1 and middle
     # Near the border: as much of the search as there is.
@@ -288,11 +379,12 @@ def follow(
     q: float,
     ahead: float,
     behind: float,
+    section: Array,
     par: LineNumbers,
     profile: Array,
     points: Array,
 ) -> int:
-    """Follows the edge from the reference row ahead, then behind.
+    """Follows the edge, or the groove's middle, from the reference row ahead, then behind.
 
     Args:
         grey: The strip's sum of channels.
@@ -303,6 +395,7 @@ def follow(
         q: Expected slope there.
         ahead: How far to go ahead [px].
         behind: How far to go back [px].
+        section: Of the groove; ``NO_SECTION`` for an edge.
         par: ``LineCfg.numbers``.
         profile: Scratch.
         points: Filled with rows t - t_ref, o, step.
@@ -312,6 +405,8 @@ def follow(
     """
     found = np.empty(2)
     count = 0
+    # From above a bend turns faster in the picture than in a fillet, and a groove's rows are surer.
+    place_gain, slope_gain = (0.7, 0.15) if section[0] > 0.0 else (0.5, 0.06)
     start = int(t_ref)
     for way in (1, -1):
         o, slope = p + q * (start + 0.5 - t_ref), q
@@ -323,10 +418,12 @@ def follow(
         hits = 0
         while abs(row + 0.5 - t_ref) <= reach and missed <= _GAP + 20 * (hits == 0) and abs(slope) < 2.0:
             search = par.search_px if hits == 0 else min(par.search_px, 1.5)
-            if count < len(points) and row_edge(grey, mask, edge, row, o, slope, search, par, profile, found):
+            if count < len(points) and row_edge(
+                grey, mask, edge, row, o, slope, search, section, par, profile, found
+            ):
                 error = found[0] - o
-                o += 0.5 * error
-                slope += way * 0.06 * error
+                o += place_gain * error
+                slope += way * slope_gain * error
                 points[count, 0], points[count, 1], points[count, 2] = row + 0.5 - t_ref, found[0], found[1]
                 count += 1
                 hits += 1
@@ -491,6 +588,64 @@ def ransac_line(
 
 
 @kernel
+def groove_line(
+    grey: Grey,
+    mask: Mask,
+    edge: Mask,
+    t_ref: float,
+    section: Array,
+    par: LineNumbers,
+    profile: Array,
+    line: Array,
+) -> bool:
+    """The line through the darkest bands as wide as the groove, one a row.
+
+    Args:
+        grey: The strip's sum of channels.
+        mask: Where the nozzle is.
+        edge: Where the edge stage found an edge.
+        t_ref: The reference's t [px].
+        section: Of the groove.
+        par: ``LineCfg.numbers``.
+        profile: Scratch.
+        line: p and q, filled.
+
+    Returns:
+        Whether there is one.
+    """
+    t, o, vote = np.empty(_MAX_POINTS), np.empty(_MAX_POINTS), np.empty(_MAX_POINTS)
+    cut, found = np.empty(CUTS), np.empty(2)
+    cuts_at(section, 0.0, cut)
+    height, width = grey.shape
+    n = 0
+    for row in range(min(height, _MAX_POINTS)):
+        left = right = 0
+        # The widest stretch of the row beside the nozzle.
+        x = 0
+        while x < width:
+            first = x
+            while x < width and not mask[row, x]:
+                x += 1
+            if x - first > right - left:
+                left, right = first, x
+            x += 1
+        count = min(right, width - 1, left + 2 * _HALF_PROFILE) - left
+        if count < 2 * _FLANK or not _profile(grey, row, 0.0, left, count, 1.0, profile):
+            continue
+        if not coarse_centre(profile, count, 0.5 * count, 0.5 * count, cut, found):
+            continue
+        o[n] = left + found[0]
+        if found[1] < par.min_contrast or not _bank_seen(edge, row, o[n], cut):
+            continue
+        t[n] = row + 0.5 - t_ref
+        vote[n] = found[1] / (1.0 + (t[n] / par.reach_px) ** 2)
+        n += 1
+    if n < par.min_points:
+        return False
+    return bool(_ransac(t, o, vote, n, par, np.uint64(int(par.seed)), line) > 0.0)
+
+
+@kernel
 def local_line(
     points: Array, n: int, t_ref: float, o_ref: float, p: float, par: LineNumbers, work: Array, line: Array
 ) -> float:
@@ -547,7 +702,18 @@ def _find_batch(
         grey_sum(images[k], grey)
         p, q = raw[k, 0], raw[k, 1]
         count = follow(
-            grey, mask, edge[k], reference[0], p, q, par.window_px, par.window_px, par, profile, points
+            grey,
+            mask,
+            edge[k],
+            reference[0],
+            p,
+            q,
+            par.window_px,
+            par.window_px,
+            NO_SECTION,
+            par,
+            profile,
+            points,
         )
         confidence[k] = local_line(points, count, reference[0], reference[1], p, par, columns, line[k])
         valid[k] = confidence[k] > 0.0

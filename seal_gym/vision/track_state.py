@@ -10,12 +10,14 @@ from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.edges import EdgeCfg
+from seal_gym.vision.groove import NO_GROOVE, GrooveCfg
 from seal_gym.vision.seam_line import LineCfg
 
 Bools = NDArray[np.bool_]
 
 MIN_ROWS = 8  # with an edge, for a view to count as seen
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
+_PLANE = 0.3  # share of the drift of a fillet's floor that a groove's plane has: it never climbs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,7 @@ class PerceptionCfg:
 
 
 class TrackNumbers(NamedTuple):
-    """``PerceptionCfg``'s numbers as the kernels take them, times in frames, and the plate's normal."""
+    """``PerceptionCfg``'s numbers as the kernels take them, times in frames; plate and groove."""
 
     memory: float
     ahead_px: float
@@ -111,15 +113,17 @@ class TrackNumbers(NamedTuple):
     follow_gain: float
     velocity_gain: float
     plate: tuple[float, float, float]
+    groove: tuple[float, float, float]
 
     @classmethod
-    def of(cls, cfg: PerceptionCfg, frame_s: float, plate: Array) -> "TrackNumbers":
+    def of(cls, cfg: PerceptionCfg, frame_s: float, plate: Array, groove: GrooveCfg | None) -> "TrackNumbers":
         """Takes the numbers from a configuration.
 
         Args:
             cfg: The configuration.
             frame_s: Duration of a frame [s].
             plate: Normal of the plate in the tip frame, shape (3,).
+            groove: The seam's section; None if the seam is an edge.
 
         Returns:
             The numbers.
@@ -127,6 +131,9 @@ class TrackNumbers(NamedTuple):
         pairs = ("level_change", "level_step")
         names = [n for n in cls._fields if hasattr(cfg, n) and n not in pairs]
         same = {name: float(getattr(cfg, name)) for name in names}
+        if groove:
+            same["height_q_m"] *= _PLANE
+            same["pitch_q_rad"] *= _PLANE
         x, y, z = (float(v) for v in plate)
         return cls(
             **same,
@@ -136,6 +143,7 @@ class TrackNumbers(NamedTuple):
             coast=cfg.coast_s / frame_s + 1e-9,
             search=cfg.search_s / frame_s + 1e-9,
             plate=(x, y, z),
+            groove=groove.numbers if groove else NO_GROOVE,
         )
 
 

@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
-from seal_gym.vision.seam_line import LineNumbers, follow, row_edge
+from seal_gym.vision.groove import CUTS, SECTION, cuts_at, section_of
+from seal_gym.vision.seam_line import NARROW_PX, LineNumbers, follow, row_edge
 from seal_gym.vision.seam_memory import fit_memory, remember
 from seal_gym.vision.strip_geometry import normalise, plate_axes, strip_slope, to_strip
 from seal_gym.vision.track_state import MIN_ROWS, Scratch, TrackNumbers, TrackState
@@ -16,6 +17,11 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
+# From above a plate the side view answers to a bend four times as much as in a fillet: its far rows are the
+# less sure, as the root, because a bend's error grows with the square of the way. And the bend is known to
+# about this share, which this far from the tip looks like a change of the plane's height and pitch.
+_GROOVE_REACH = 0.5
+_BEND_SHARE, _BEND_M = 0.3, 2.5 * _MM
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
 _BENT, _BENT_SHARE = (
@@ -25,8 +31,25 @@ _BENT, _BENT_SHARE = (
 
 
 @kernel
+def _half_width(section: Array, q: float) -> float:
+    """Of a groove in a row [px]; 0 of an edge."""
+    if section[0] <= 0.0:
+        return 0.0
+    cut = np.empty(CUTS)
+    cuts_at(section, q, cut)
+    return float(cut[2])
+
+
+@kernel
 def _usual(
-    i: int, view: int, mask: Bools, line: Array, par: TrackNumbers, state: TrackState, s: Scratch
+    i: int,
+    view: int,
+    mask: Bools,
+    line: Array,
+    section: Array,
+    par: TrackNumbers,
+    state: TrackState,
+    s: Scratch,
 ) -> bool:
     """Whether plate and wall beside the expected line are as bright as they usually are.
 
@@ -38,12 +61,13 @@ def _usual(
     usual = steady = True
     trust = 1.0 if state.steady[i, view] >= _SETTLED else 0.7
     fresh = np.empty(2)
+    half = _half_width(section, line[2])
     # In the side view the wall changes too much at corners; the height's gate guards it.
     for side in range(view, 2):
         total, count = 0.0, 0
         for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
             o = line[1] + line[2] * (row + 0.5 - line[0])
-            first = int(o) + 2 if side == 1 else int(o) - 1 - _BESIDE
+            first = int(o + half) + 2 if side == 1 else int(o - half) - 1 - _BESIDE
             for x in range(max(first, 0), min(first + _BESIDE, width)):
                 if not mask[row, x]:
                     total += s.grey[row, x]
@@ -92,18 +116,31 @@ def track_front(
 
     Returns whether the front view showed the seam; without, the memory carries on.
     """
-    line, n, m = np.empty(3), np.empty(3), np.empty(3)
-    seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0 and _usual(i, 0, mask, line, par, state, s)
+    line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
+    plate_axes(d, par.plate, n, m)
+    seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0
+    seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
+    seen = seen and _usual(i, 0, mask, line, section, par, state, s)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
-            s.grey, mask, s.edge, ref[0], o, line[2], par.ahead_px, par.ahead_px, lp, s.profile, s.points
+            s.grey,
+            mask,
+            s.edge,
+            ref[0],
+            o,
+            line[2],
+            par.ahead_px,
+            par.ahead_px,
+            section,
+            lp,
+            s.profile,
+            s.points,
         )
         seen = count >= MIN_ROWS
         if seen:
             state.clock[i] += 1
             remember(i, tip, count, ref, g, par, state, s)
-    plate_axes(d, par.plate, n, m)
     oldest = max(state.clock[i] - int(par.memory), 0)
     fitted = fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
     if seen and not fitted:
@@ -157,6 +194,15 @@ def _side_frame(
 
 
 @kernel
+def _reach(section: Array, q: float, par: TrackNumbers) -> float:
+    """How far from the tip the side view's rows count fully, twice [px]."""
+    if section[0] <= 0.0:
+        return par.side_px
+    # A narrow groove needs far rows: those near the tip are under the nozzle, and all cut the same pixels.
+    return par.side_px * (_GROOVE_REACH if 2.0 * _half_width(section, q) >= NARROW_PX else 1.0)
+
+
+@kernel
 def _side_residual(
     mask: Bools,
     g: ViewGeometry,
@@ -166,6 +212,7 @@ def _side_residual(
     p: Array,
     d: Array,
     m: Array,
+    section: Array,
     bend: float,
     line: Array,
     scale: float,
@@ -181,6 +228,7 @@ def _side_residual(
     # Above the plate the seam may come into the ROI only ahead of the tip.
     below = line[1] - (mask.shape[1] - _HIDDEN)
     skip = min(-below / line[2], float(mask.shape[0])) if below > 0.0 and line[2] < -1e-3 else 0.0
+    reach = _reach(section, line[2], par)
     first = int(line[0] + skip - par.side_px)
     for row in range(first, int(line[0] + skip + par.side_px) + 1):
         t = row + 0.5 - line[0]
@@ -195,11 +243,11 @@ def _side_residual(
         if abs(t) > 1e-9:
             # Chord of a parabola: its end's slope is twice the chord's less the start's.
             slope = min(max(2.0 * (b[1] - line[1]) / t - line[2], -2.0), 2.0)
-        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp.search_px, lp, s.profile, found):
+        if not row_edge(s.grey, mask, s.edge, row, b[1], slope, lp.search_px, section, lp, s.profile, found):
             continue
         error = found[0] - b[1]
         # Far rows hang on the curve's bend, which is less sure.
-        w = found[1] * found[1] / (1.0 + (2.0 * (t - skip) / par.side_px) ** 4)
+        w = found[1] * found[1] / (1.0 + (2.0 * (t - skip) / reach) ** 4)
         s0 += w
         s1 += w * t
         s2 += w * t * t
@@ -241,18 +289,23 @@ def track_side(
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    per_m, out = np.empty(2), np.empty(5)
+    per_m, out, section = np.empty(2), np.empty(5), np.empty(SECTION)
     plate_axes(d, par.plate, n, m)
     if not _side_frame(p, d, n, g, lift, line, per_m):
         return False
-    if not _usual(i, 1, mask, line, par, state, s):
+    if not section_of(p, d, n, m, 1, g, par.groove, section):
         return False
-    if not _side_residual(mask, g, lp, par, s, p, d, m, bend, line, per_m[0], out):
+    if not _usual(i, 1, mask, line, section, par, state, s):
+        return False
+    if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return False
     # Neighbouring rows share pixels: five times the variance of independent ones.
     noise = 5.0 * par.row_sigma_m**2
     r_height = noise * out[2] + _HEIGHT_FLOOR**2
     r_pitch = noise * out[3] * per_m[0] ** 2 + _PITCH_FLOOR**2
+    if section[0] > 0.0:
+        r_height += (_BEND_SHARE * bend * _BEND_M * _BEND_M) ** 2
+        r_pitch += (2.0 * _BEND_SHARE * bend * _BEND_M) ** 2
     variance = state.variance[i]
     height = _kalman(variance, 0, par.height_q_m, out[0] / per_m[1], r_height, par.gate)
     if height == 0.0:

@@ -37,6 +37,7 @@ class Workpiece:
         solids: What gun, arm and cameras can hit.
         pose: Nominal ``T_base_part`` [m]; each episode displaces it (see ``SealTaskCfg``).
         placed: Whether the user chose the pose; if not, the environment takes another where this one fails.
+        groove_width: Of the groove whose middle is the seam, and its depth [m]; 0 in a fillet.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Workpiece:
     solids: tuple[Solid, ...]
     pose: Array
     placed: bool = True
+    groove_width: float = 0.0
 
     @classmethod
     def from_polyline(
@@ -98,6 +100,7 @@ class Workpiece:
             solids=tuple(pieces),
             pose=_place(pose, seam),
             placed=pose is not None,
+            groove_width=groove_width if joint == "groove" else 0.0,
         )
 
     @classmethod

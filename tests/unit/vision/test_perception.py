@@ -9,8 +9,9 @@ from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
 from seal_gym.vision.edges import EdgeStage
 from seal_gym.vision.features import RoiFeatures, ViewGeometry, oracle_lines, update_features
-from seal_gym.vision.perception import Perception, PerceptionCfg
+from seal_gym.vision.perception import GrooveCfg, Perception, PerceptionCfg
 from seal_gym.workpieces.seam import seam_in_world
+from seal_gym.workpieces.workpiece import Workpiece
 
 FRAME_S = 1 / 30
 
@@ -27,8 +28,16 @@ class Ride:
         self.phase = np.array(seeds) * 1.7
 
     def perception(self, n=None, **kwargs):
-        nozzle = self.core.sensors.nozzle
-        return Perception(n or self.n, self.views, nozzle, FRAME_S, PerceptionCfg(**kwargs))
+        nozzle, width = self.core.sensors.nozzle, self.core.scene.workpiece.groove_width
+        return Perception(
+            n or self.n,
+            self.views,
+            nozzle,
+            FRAME_S,
+            PerceptionCfg(**kwargs),
+            plate=self.core._start[2, :3] if width else None,
+            groove=GrooveCfg(width_m=width, depth_m=width) if width else None,
+        )
 
     def frame(self, k):
         """Images, tip poses and the oracle's lines of a frame."""
@@ -75,6 +84,49 @@ def test_a_corner_within_the_targets():
     error = run(Ride("rectangular", range(6), 0.095), 87)[27:]
     rms = np.sqrt((error**2).mean(axis=(0, 1)))
     assert (rms[:2] <= 0.3).all() and (rms[2:] <= 2.0).all()
+
+
+def groove(points, lean_deg=0.0, width=2e-3):
+    lean = np.deg2rad(lean_deg)
+    approach = np.array([0.0, -np.sin(lean), np.cos(lean)])  # right of a travel along x
+    return Workpiece.from_polyline(points, approach, joint="groove", groove_width=width)
+
+
+LINE = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+ARC = np.linspace(-1.0, 1.0, 61)
+BEND = 0.06 * np.column_stack((np.sin(ARC), 1.0 - np.cos(ARC), 0 * ARC))
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        groove(LINE),
+        groove(LINE, 20.0),
+        groove(LINE, -20.0),
+        groove(LINE, width=3e-3),
+        groove(BEND),
+    ],
+    ids=["upright", "leaning to the right", "leaning to the left", "wide", "bend"],
+)
+def test_the_middle_of_a_groove_within_the_targets(part):
+    """Its banks are 3 px and more off the middle."""
+    error = run(Ride(part, range(4), 0.04), 50)[20:]
+    rms = np.sqrt((error**2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.2).all() and (rms[2:] <= 0.6).all()
+
+
+def test_a_fine_groove_within_the_targets_where_it_is_seen():
+    """It is 1.5 px wide, and where the gun sways it comes under the nozzle in the side view."""
+    ride = Ride(groove(LINE, width=5e-4), range(4), 0.04)
+    eyes, errors = ride.perception(), []
+    for k in range(50):
+        images, tips, truth = ride.frame(k)
+        lines = eyes.update(images.front, images.side, tips)
+        if k >= 20 and lines.valid.all():
+            errors.append(ride.errors(lines, truth))
+    assert len(errors) >= 25
+    rms = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 1)))
+    assert (rms[:2] <= 0.2).all() and (rms[2:] <= 0.6).all()
 
 
 def test_rows_never_mix_and_runs_repeat():
