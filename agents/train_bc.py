@@ -230,6 +230,7 @@ class _Student(BasePolicy):
         action: Tensor = self.net(observation)
         return action
 
+    # SB3 declares a tensor or a dict of tensors; the environments' observations are one box.
     def _predict(self, observation: Tensor, deterministic: bool = False) -> Tensor:  # type: ignore[override]
         del deterministic
         return self.forward(observation).clamp(-1.0, 1.0)

@@ -1,4 +1,5 @@
 import json
+import shlex
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -285,8 +286,8 @@ def test_the_command_writes_a_policy_that_loads(episodes, tmp_path, monkeypatch,
         episodes=list(pairwise(lengths)),
     )
     monkeypatch.setattr(train_bc.demos, "load", lambda _: data)
-    options = "--policy neural_control --seed 4 --data D --epochs 2 --out".split() + [str(tmp_path)]
-    train_bc.main([*options, "--validate", "1", "--perception", "oracle"])
+    command = "--policy neural_control --seed 4 --data D --epochs 2 --validate 1 --perception oracle --out"
+    train_bc.main([*shlex.split(command), str(tmp_path)])
     path = tmp_path / "neural_control-seed4.safetensors"
     assert str(path) in capsys.readouterr().out
     policy = policies.load(path)
