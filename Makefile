@@ -38,7 +38,7 @@ test-slow: $(VENV)/.setup-dev  ## the tests that take minutes or the network, su
 
 test-latest: $(LATEST)/.setup  ## core, wrappers and reinforcement learning on the newest gymnasium and stable-baselines3
 	@OMP_NUM_THREADS=1 $(LATEST)/bin/python -m pytest -n $(JOBS) -m "not slow" tests/unit tests/envs tests/wrappers \
-	  tests/agents/test_train_sb3.py tests/agents/test_enjoy.py $(ARGS)
+	  tests/agents/test_train_sb3.py tests/agents/test_enjoy.py tests/agents/test_load_policy.py $(ARGS)
 
 lint: lint-rules lint-format lint-types lint-imports  ## ruff, mypy, import-linter
 

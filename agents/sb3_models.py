@@ -176,8 +176,9 @@ def _fresh(path: Path, algorithm: str, data: dict[str, Any]) -> Any:
     _plain(ours, path, f"its policy is not {algorithm}'s MlpPolicy")
     observation, action = _texts(data, "observation_space"), _texts(data, "action_space")
     _plain(observation.get("_shape") == [FEATURES], path, f"it does not take the {FEATURES} features alone")
-    ends = (action.get("low_repr"), action.get("high_repr"))
-    _plain(ends == ("-1.0", "1.0"), path, f"its actions end at {ends}, not at -1 and 1")
+    ends = [str(action.get(side)) for side in ("low", "high")]
+    plain = [re.fullmatch(rf"\[(\s*{end}\.)+\s*\]", text) for end, text in zip((-1, 1), ends, strict=True)]
+    _plain(all(plain), path, f"its actions end at {' and '.join(ends)}, not at -1 and 1")
     _plain(data.get("use_sde") is False, path, "it explores by gSDE")
     kinds = {"ActorCriticPolicy": ActorCriticPolicy, "SACPolicy": SACPolicy, "TD3Policy": TD3Policy}
     try:

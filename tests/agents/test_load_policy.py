@@ -270,7 +270,7 @@ def test_damaged_parameters_are_refused(content, message, tmp_path):
         (("policy_kwargs", {"net_arch": [[[]]]}), "cannot be built"),
         (("policy_class", None), "is not PPO's MlpPolicy"),
         (("observation_space", {"_shape": [36]}), "does not take the 35 features alone"),
-        (("action_space", {"_shape": [6], "low_repr": "-2.0", "high_repr": "2.0"}), "its actions end at"),
+        (("action_space", {"_shape": [6], "low": "[-2. -2.]", "high": "[2. 2.]"}), "its actions end at"),
     ],
 )
 def test_descriptions_that_do_not_fit_are_refused(change, message, tmp_path):
