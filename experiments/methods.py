@@ -120,21 +120,22 @@ def check_methods(methods: Sequence[str], folder: Path, training_seeds: Sequence
     Raises:
         ConfigError: If a policy is unknown or has no weights: what to do about each.
     """
-    problems, weights = [], []
+    weights: list[Weights] = []
+    unknown = [m for m in methods if m not in agents.POLICIES]
+    problems = [f"{m}: no policy of that name, agents has {sorted(agents.POLICIES)}" for m in unknown]
+    untrained = []
     for method in methods:
-        if method not in agents.POLICIES:
-            problems.append(f"{method}: no policy of that name, agents has {sorted(agents.POLICIES)}")
-        elif is_learned(method):
+        if method not in unknown and is_learned(method):
             found, missing = find_weights(folder, method, training_seeds)
             weights += found
             if missing:
-                problems.append(f"{method}: {', '.join(missing)} missing; train: {how_to_train(method)}")
+                untrained.append(f"{method}: {', '.join(missing)} missing; train: {how_to_train(method)}")
+    if untrained:
+        untrained.append("then agents.ship copies the seeds")
+        problems += [f"in {folder}:", *untrained]
     if problems:
-        lines = "\n  ".join(problems)
-        raise ConfigError(
-            f"in {folder}:\n  {lines}\n  then agents.ship copies the seeds; or name the methods to "
-            "run with --method (and their --training-seeds)"
-        )
+        problems.append("or name the methods to run with --method (and their --training-seeds)")
+        raise ConfigError("methods are missing:\n  " + "\n  ".join(problems))
     return weights
 
 

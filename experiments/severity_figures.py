@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt  # the backend has to be chosen first
 Row = dict[str, Any]
 _ACROSS = 3  # charts side by side on the page
 _MARKERS = "osDv^P*X"
-_DODGE = 0.035  # of severity, from one method to the next: they often lie on each other
+_DODGE = 0.05  # of severity, from one method to the next: they often lie on each other
 _FEW = 50.0  # percent; an RMSE over fewer is that of the lucky ones
 
 
