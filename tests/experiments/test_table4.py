@@ -71,7 +71,7 @@ def test_names_of_a_table_are_checked():
 
 
 def rerun(document, row):
-    """One environment step by step, from the JSON alone; and how far its part went [mm], how it turned [deg]."""
+    """A run from the JSON alone: its metrics, how far its part went [mm] and turned [deg] in each step."""
     env = trials.rebuild(row["env_spec"], document["environments"])
     policy = agents.load_policy(row["method"], env)
     observation, info = env.reset(seed=row["env_spec"]["seed"])
