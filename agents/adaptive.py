@@ -1,0 +1,458 @@
+"""The classical adaptive baseline: map the seam ahead of the tip with a laser profile sensor, replan, play back.
+
+Manorathna et al. 2014 ("Feature extraction and tracking of a weld joint for adaptive robotic welding"), with
+which Zhou et al. compare themselves (their reference 19, Table 4); formulas.md section 3. Each frame a depth
+profile across the seam gives one point of it, a look-ahead before the tip. Points are gated, moved to the base
+frame and kept. Every few points a polynomial through the last ones becomes the path, which a position servo
+follows at fixed speed. The method takes the part to stand still: when the tip comes to a point, the point is
+look-ahead / speed old.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from seal_gym.core.errors import ConfigError, is_number, require
+from seal_gym.core.frames import Array
+from seal_gym.core.kinematics import tip_kinematics
+from seal_gym.envs.core import SealCore
+from seal_gym.sim.depth import DepthCfg, DepthSensor
+from seal_gym.sim.depth_seam import SeamPointCfg, find_seam
+
+_MM, _DEG = 1e-3, float(np.deg2rad(1.0))
+_MAD_TO_SIGMA = 1.4826
+_NEWTON_STEPS = 3
+_Y = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptiveCfg:
+    """Sensor, path and servo; the defaults were chosen by ``python -m agents.tune_adaptive``.
+
+    Attributes:
+        depth: The sensor.
+        seam: How the seam is found in a profile.
+        window: Points that a path is fitted through (W).
+        replan: Points from one fit to the next (K).
+        order: Largest order of the polynomial.
+        spacing_m: A point this far beyond the last one is kept [m].
+        span_m: Length of the points that each order of the polynomial needs [m].
+        gate_mad: Points farther from the path than this many MAD of the others are outliers.
+        gate_floor_m: Distance from the path that is never an outlier [m].
+        patience: Outliers in a row after which the map is given up and begun anew.
+        extrapolate_m: How far beyond its last point a path is followed [m].
+        braking_m_s2: Deceleration towards the end of the path [m/s^2].
+        omega_n: Natural frequency of the servo [rad/s].
+        zeta: Its damping ratio.
+        approach_m_s: Largest speed towards the path [m/s].
+        turning_rad_s: Largest speed of turning towards the path [rad/s].
+        land_m: Distance from the path below which the gun begins to travel [m].
+    """
+
+    depth: DepthCfg = field(default_factory=DepthCfg)
+    seam: SeamPointCfg = field(default_factory=SeamPointCfg)
+    window: int = 24
+    replan: int = 1
+    order: int = 2
+    spacing_m: float = 2e-4
+    span_m: float = 2e-3
+    gate_mad: float = 3.0
+    gate_floor_m: float = 1e-3
+    patience: int = 5
+    extrapolate_m: float = 2e-3
+    braking_m_s2: float = 0.1
+    omega_n: float = 12.0
+    zeta: float = 0.8
+    approach_m_s: float = 0.025
+    turning_rad_s: float = 1.0
+    land_m: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        for name, low, high in (("window", 4, 1000), ("replan", 1, 1000), ("order", 1, 3), ("patience", 1, 1000)):
+            value = getattr(self, name)
+            require(
+                is_number(value) and int(value) == value and low <= value <= high,
+                f"AdaptiveCfg.{name} = {value!r}: must be a whole number in {low}..{high}",
+            )
+        for name in ("spacing_m", "span_m", "gate_mad", "gate_floor_m", "braking_m_s2", "omega_n", "zeta"):
+            self._positive(name)
+        for name in ("approach_m_s", "turning_rad_s", "land_m"):
+            self._positive(name)
+        value = self.extrapolate_m
+        require(is_number(value) and value >= 0, f"AdaptiveCfg.extrapolate_m = {value!r}: must be >= 0")
+
+    def _positive(self, name: str) -> None:
+        value = getattr(self, name)
+        require(is_number(value) and value > 0, f"AdaptiveCfg.{name} = {value!r}: must be > 0")
+
+
+class Path(NamedTuple):
+    """A polynomial in arc length through points of the seam.
+
+    Attributes:
+        coefficients: Of 1, (u - origin), (u - origin)^2, ..., shape (order + 1, 3), m.
+        origin: Arc length about which the polynomial is written [m].
+        end: Arc length of the last point [m].
+        spread: Median distance of the points from it [m].
+    """
+
+    coefficients: Array
+    origin: float
+    end: float
+    spread: float
+
+    def at(self, u: Array | float) -> Array:
+        """Positions at arc lengths of shape (...): shape (..., 3), m."""
+        return np.asarray(self._powers(u) @ self.coefficients)
+
+    def slope(self, u: float) -> Array:
+        """First derivative by arc length, shape (3,)."""
+        n = np.arange(1, len(self.coefficients))
+        return np.asarray((n * self._powers(u)[: len(n)]) @ self.coefficients[1:])
+
+    def bend(self, u: float) -> Array:
+        """Second derivative by arc length, shape (3,), 1/m."""
+        n = np.arange(2, len(self.coefficients))
+        return np.asarray((n * (n - 1) * self._powers(u)[: len(n)]) @ self.coefficients[2:])
+
+    def _powers(self, u: Array | float) -> Array:
+        return np.power.outer(np.asarray(u, dtype=np.float64) - self.origin, np.arange(len(self.coefficients)))
+
+
+class Track(NamedTuple):
+    """What the controller remembers of one simulation.
+
+    Attributes:
+        points: Kept points of the seam in the base frame, oldest first, shape (k, 3), m.
+        arc: Their arc length from the first point of the episode, shape (k,), m.
+        path: The planned path; None before the first point.
+        unplanned: Points kept since it was fitted.
+        outliers: Points refused in a row.
+        at: Arc length of the path abreast of the tip [m].
+        landed: Whether the gun has come down to the path and travels.
+    """
+
+    points: Array = np.empty((0, 3))
+    arc: Array = np.empty(0)
+    path: Path | None = None
+    unplanned: int = 0
+    outliers: int = 0
+    at: float = 0.0
+    landed: bool = False
+
+
+# -- the map ---------------------------------------------------------------------------------------------
+
+
+def extend(track: Track, point: Array, pose: Array, cfg: AdaptiveCfg) -> Track:
+    """Takes one measured point of the seam into the map, or refuses it.
+
+    Args:
+        track: The map.
+        point: In the base frame, shape (3,), m.
+        pose: ``T_base_tip``, shape (4, 4), m.
+        cfg: Gate, spacing and fit.
+
+    Returns:
+        The new map.
+    """
+    forward = pose[:3, _Y]
+    if track.path is None or not track.landed:
+        # The gun stands: nothing to join the point to, and a later one is as good and newer.
+        return _begin(point, forward)
+    if _off(track.path, point) > max(cfg.gate_mad * track.path.spread, cfg.gate_floor_m):
+        if track.outliers < cfg.patience:
+            return track._replace(outliers=track.outliers + 1)
+        return _begin(point, forward)._replace(landed=True)
+    step = point - track.points[-1]
+    if step @ forward < cfg.spacing_m:
+        return track._replace(outliers=0)
+    kept = slice(-cfg.window, None)
+    points = np.concatenate((track.points, point[None]))[kept]
+    arc = np.append(track.arc, track.arc[-1] + np.linalg.norm(step))[kept]
+    track = track._replace(points=points, arc=arc, unplanned=track.unplanned + 1, outliers=0)
+    if track.unplanned < cfg.replan:
+        return track
+    return track._replace(path=fit(points, arc, forward, cfg), unplanned=0)
+
+
+def _begin(point: Array, forward: Array) -> Track:
+    """A map of one point: the path goes straight ahead through it."""
+    path = Path(np.stack((point, forward)), 0.0, 0.0, 0.0)
+    return Track(points=point[None], arc=np.zeros(1), path=path)
+
+
+def _off(path: Path, point: Array) -> float:
+    """Distance from a point to the path's continuation beyond its end [m]."""
+    tangent = path.slope(path.end)
+    off = point - path.at(path.end)
+    along = float(off @ tangent / (tangent @ tangent))
+    return float(np.linalg.norm(point - path.at(path.end + along)))
+
+
+def fit(points: Array, arc: Array, forward: Array, cfg: AdaptiveCfg) -> Path:
+    """Least-squares polynomial in arc length through points of the seam.
+
+    Args:
+        points: Oldest first, shape (k, 3), m.
+        arc: Their arc lengths, shape (k,), m.
+        forward: Direction of travel, for points too close together to have one, shape (3,).
+        cfg: Largest order, and the span that each order needs.
+
+    Returns:
+        The path.
+    """
+    origin, span = float(arc[0] + arc[-1]) / 2, float(arc[-1] - arc[0])
+    order = min(cfg.order, int(span / cfg.span_m), len(arc) - 2)
+    if order < 1:
+        coefficients = np.stack((points.mean(axis=0), forward))
+        origin = float(arc.mean())
+    else:
+        scaled = np.vander((arc - origin) / span, order + 1, increasing=True)
+        coefficients = np.linalg.lstsq(scaled, points, rcond=None)[0] / span ** np.arange(order + 1)[:, None]
+    path = Path(coefficients, origin, float(arc[-1]), 0.0)
+    off = np.linalg.norm(path.at(arc) - points, axis=1)
+    return path._replace(spread=_MAD_TO_SIGMA * float(np.median(off)))
+
+
+# -- the servo -------------------------------------------------------------------------------------------
+
+
+class Aim(NamedTuple):
+    """Where the path is in the tip frame, and how it goes on.
+
+    Attributes:
+        error: Displacement and rotation vector that bring the tip onto the path, shape (6,), m and rad.
+        reference: Twist of a tip that travels on it, shape (6,), m/s and rad/s.
+    """
+
+    error: Array
+    reference: Array
+
+
+def abreast(path: Path, pose: Array, start: float) -> float:
+    """Arc length of the path where it crosses the tip's xz plane.
+
+    Args:
+        path: The path.
+        pose: ``T_base_tip``, shape (4, 4), m.
+        start: Where to begin the search [m].
+
+    Returns:
+        Arc length [m].
+    """
+    u = start
+    for _ in range(_NEWTON_STEPS):
+        ahead = float((path.at(u) - pose[:3, 3]) @ pose[:3, _Y])
+        # A path that turns away must not send the search off.
+        u -= ahead / max(float(path.slope(u) @ pose[:3, _Y]), 0.3)
+    return u
+
+
+def speed_left(left_m: float, speed_m_s: float, braking_m_s2: float) -> float:
+    """Speed from which a gun still stops within the path that is left: ``sqrt(2 a d)``, at most nominal.
+
+    Args:
+        left_m: Length of path that is left [m].
+        speed_m_s: Nominal [m/s].
+        braking_m_s2: Deceleration [m/s^2].
+
+    Returns:
+        [m/s].
+    """
+    return float(min(speed_m_s, np.sqrt(2.0 * braking_m_s2 * max(left_m, 0.0))))
+
+
+def aim(path: Path, at: float, pose: Array, speed_m_s: float, stand_off_m: float, lean_rad: float) -> Aim:
+    """Where the tip should be and how it should move.
+
+    Args:
+        path: The path: on the seam.
+        at: Arc length abreast of the tip [m].
+        pose: ``T_base_tip``, shape (4, 4), m.
+        speed_m_s: Of the tip along the path [m/s].
+        stand_off_m: From the seam back along the nozzle [m].
+        lean_rad: Rotation about y that restores the taught lean [rad].
+
+    Returns:
+        Error and reference in the tip frame.
+    """
+    turn = pose[:3, :3].T
+    seam = turn @ (path.at(at) - pose[:3, 3])
+    slope = turn @ path.slope(at)
+    length = float(np.linalg.norm(slope))
+    tangent, bend = slope / length, turn @ path.bend(at) / length**2
+    heading = np.array([np.arctan2(tangent[2], tangent[1]), lean_rad, -np.arctan2(tangent[0], tangent[1])])
+    # The tip travels on a parallel of the seam, a stand-off away: on the outside of a bend it has farther to go.
+    rate = speed_m_s / max(1.0 - stand_off_m * bend[2], 0.5)
+    turning = rate * np.array([bend[2], 0.0, -bend[0]])
+    offset = np.array([seam[0], 0.0, seam[2] + stand_off_m])
+    return Aim(np.concatenate((offset, heading)), np.concatenate((speed_m_s * tangent, turning)))
+
+
+def servo(target: Aim, twist: Array, cfg: AdaptiveCfg) -> Array:
+    """Second-order position servo with saturated errors.
+
+    Args:
+        target: Where to.
+        twist: Body twist of the tip, shape (6,), m/s and rad/s.
+        cfg: Gains and limits.
+
+    Returns:
+        Tip acceleration ``omega_n^2 sat(error) + 2 zeta omega_n (reference - twist)``, shape (6,).
+    """
+    damping = 2.0 * cfg.zeta * cfg.omega_n
+    stiffness = cfg.omega_n**2
+    shift = _saturated(target.error[:3], cfg.approach_m_s * damping / stiffness)
+    turn = _saturated(target.error[3:], cfg.turning_rad_s * damping / stiffness)
+    return np.asarray(
+        stiffness * np.concatenate((shift, turn)) + damping * (target.reference - twist), dtype=np.float64
+    )
+
+
+def _saturated(error: Array, limit: float) -> Array:
+    """The vector, shortened to a length if it is longer."""
+    return np.asarray(error * min(1.0, limit / max(float(np.linalg.norm(error)), 1e-12)))
+
+
+# -- the policy ------------------------------------------------------------------------------------------
+
+
+class Adaptive:
+    """Maps, replans and follows, for every simulation of an environment.
+
+    It reads joint angles, twist and lean from the observation, and its own sensor from the simulation: never the
+    pose of the part or of the seam. Between calls it keeps nothing: its memory is the ``state`` of ``predict``,
+    which must be handed back, and the sensor's noise depends on the episode's seed and the frame alone.
+
+    Attributes:
+        control: The ``control`` its environment needs.
+        cfg: The configuration.
+    """
+
+    control = "tip"
+
+    def __init__(self, core: SealCore, cfg: AdaptiveCfg | None = None) -> None:
+        """Mounts the sensor on the guns.
+
+        Args:
+            core: The simulations.
+            cfg: The configuration.
+        """
+        self.cfg = cfg or AdaptiveCfg()
+        self._core = core
+        self._sensor = DepthSensor(core.scene, self.cfg.depth)
+        cell = core.cfg.cell
+        self._process = cell.process
+        self._scale = np.array([cell.limits.linear_m_s2] * 3 + [cell.limits.angular_rad_s2] * 3)
+
+    @classmethod
+    def of(cls, env: Any, cfg: AdaptiveCfg | None = None) -> Self:
+        """The policy of an environment.
+
+        Args:
+            env: Single or vectorised, wrapped or not.
+            cfg: The configuration.
+
+        Returns:
+            The policy.
+
+        Raises:
+            ConfigError: If there is no environment to mount the sensor in.
+        """
+        core = getattr(getattr(env, "unwrapped", env), "core", None)
+        if not isinstance(core, SealCore):
+            raise ConfigError(
+                f"policy 'adaptive' with env = {env!r}: it has a sensor of its own, so give the environment: "
+                "load_policy('adaptive', env)"
+            )
+        return cls(core, cfg)
+
+    def predict(
+        self,
+        observation: NDArray[np.float32] | dict[str, NDArray[Any]],
+        state: tuple[Track, ...] | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], tuple[Track, ...]]:
+        """Actions for observations, as Stable-Baselines3's recurrent policies give them.
+
+        Args:
+            observation: Of the environment's N simulations (or of its only one), as ``SealEnv`` documents it,
+                just observed: the sensor measures now.
+            state: What the last call gave; None at the start.
+            episode_start: Which simulations begin an episode, shape (N,).
+            deterministic: It always is.
+
+        Returns:
+            Actions of shape (6,) or (N, 6), and the new state.
+        """
+        del deterministic
+        features = observation["features"] if isinstance(observation, dict) else observation
+        rows = np.atleast_2d(np.asarray(features, dtype=np.float64))
+        n = len(rows)
+        require(
+            n == self._core.n,
+            f"observation of {n} simulations: the environment that this policy was made for has {self._core.n}",
+        )
+        fresh = self._core.frames == 0
+        if episode_start is not None:
+            fresh = fresh | np.asarray(episode_start)
+        old = state or (Track(),) * n
+        tracks = [Track() if new else track for track, new in zip(old, fresh, strict=True)]
+        pose = tip_kinematics(np.ascontiguousarray(rows[:, 23:29]), np.ascontiguousarray(rows[:, 29:35])).pose
+        points = self._points(pose)
+        acted = [self._act(*row) for row in zip(tracks, points, pose, rows, strict=True)]
+        accel = np.stack([a for _, a in acted])
+        action = np.clip(accel / self._scale, -1.0, 1.0).astype(np.float32)
+        return (action if features.ndim == 2 else action[0]), tuple(track for track, _ in acted)
+
+    def _points(self, pose: Array) -> list[Array | None]:
+        """The seam's points that the sensors see now, in the base frame."""
+        core = self._core
+        # As the cameras' noise: the same frame of the same episode has the same.
+        rngs = [
+            np.random.default_rng([int(seed), int(frame)])
+            for seed, frame in zip(core.sensors.look.seed, core.frames, strict=True)
+        ]
+        profile = self._sensor.measure(core.tip.pose, core.arm.part_pose, rngs)
+        found = [find_seam(across, depth, self.cfg.seam) for across, depth in zip(*profile, strict=True)]
+        return [
+            None if fix is None else self._sensor.to_base(np.array(fix.across_m), np.array(fix.depth_m), T)
+            for fix, T in zip(found, pose, strict=True)
+        ]
+
+    def _act(self, track: Track, point: Array | None, pose: Array, row: Array) -> tuple[Track, Array]:
+        """One simulation's new memory and tip acceleration."""
+        cfg, process = self.cfg, self._process
+        twist = np.concatenate((_MM * row[11:14], _DEG * row[14:17]))
+        if point is not None:
+            begun = track.path is None
+            track = extend(track, point, pose, cfg)
+            if begun or len(track.arc) == 1:
+                track = track._replace(at=-cfg.depth.look_ahead_m)
+        if track.path is None:
+            return track, servo(Aim(np.zeros(6), np.zeros(6)), twist, cfg)
+        path = track.path
+        at = abreast(path, pose, track.at)
+        left = path.end + cfg.extrapolate_m - at
+        speed = speed_left(left, process.speed_m_s, cfg.braking_m_s2) if track.landed else 0.0
+        target = aim(path, at, pose, speed, process.stand_off_m, _DEG * row[10])
+        landed = track.landed or bool(np.linalg.norm(target.error[:3]) < cfg.land_m)
+        return track._replace(at=at, landed=landed), servo(target, twist, cfg)
+
+
+def with_look_ahead(cfg: AdaptiveCfg, look_ahead_m: float) -> AdaptiveCfg:
+    """The configuration with the sensor's line elsewhere.
+
+    Args:
+        cfg: The configuration.
+        look_ahead_m: Of the line [m].
+
+    Returns:
+        The new configuration.
+    """
+    return replace(cfg, depth=replace(cfg.depth, look_ahead_m=look_ahead_m))
