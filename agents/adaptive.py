@@ -8,7 +8,7 @@ follows at fixed speed. The method takes the part to stand still: when the tip c
 look-ahead / speed old.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -162,11 +162,11 @@ def extend(track: Track, point: Array, pose: Array, cfg: AdaptiveCfg) -> Track:
     forward = pose[:3, _Y]
     if track.path is None or not track.landed:
         # The gun stands: nothing to join the point to, and a later one is as good and newer.
-        return _begin(point, forward)
+        return _begin(point, forward, cfg)
     if _off(track.path, point) > max(cfg.gate_mad * track.path.spread, cfg.gate_floor_m):
         if track.outliers < cfg.patience:
             return track._replace(outliers=track.outliers + 1)
-        return _begin(point, forward)._replace(landed=True)
+        return _begin(point, forward, cfg)._replace(landed=True)
     step = point - track.points[-1]
     if step @ forward < cfg.spacing_m:
         return track._replace(outliers=0)
@@ -179,10 +179,10 @@ def extend(track: Track, point: Array, pose: Array, cfg: AdaptiveCfg) -> Track:
     return track._replace(path=fit(points, arc, forward, cfg), unplanned=0)
 
 
-def _begin(point: Array, forward: Array) -> Track:
+def _begin(point: Array, forward: Array, cfg: AdaptiveCfg) -> Track:
     """A map of one point: the path goes straight ahead through it."""
     path = Path(np.stack((point, forward)), 0.0, 0.0, 0.0)
-    return Track(points=point[None], arc=np.zeros(1), path=path)
+    return Track(points=point[None], arc=np.zeros(1), path=path, at=-cfg.depth.look_ahead_m)
 
 
 def _off(path: Path, point: Array) -> float:
@@ -430,10 +430,7 @@ class Adaptive:
         cfg, process = self.cfg, self._process
         twist = np.concatenate((_MM * row[11:14], _DEG * row[14:17]))
         if point is not None:
-            begun = track.path is None
             track = extend(track, point, pose, cfg)
-            if begun or len(track.arc) == 1:
-                track = track._replace(at=-cfg.depth.look_ahead_m)
         if track.path is None:
             return track, servo(Aim(np.zeros(6), np.zeros(6)), twist, cfg)
         path = track.path
@@ -443,16 +440,3 @@ class Adaptive:
         target = aim(path, at, pose, speed, process.stand_off_m, _DEG * row[10])
         landed = track.landed or bool(np.linalg.norm(target.error[:3]) < cfg.land_m)
         return track._replace(at=at, landed=landed), servo(target, twist, cfg)
-
-
-def with_look_ahead(cfg: AdaptiveCfg, look_ahead_m: float) -> AdaptiveCfg:
-    """The configuration with the sensor's line elsewhere.
-
-    Args:
-        cfg: The configuration.
-        look_ahead_m: Of the line [m].
-
-    Returns:
-        The new configuration.
-    """
-    return replace(cfg, depth=replace(cfg.depth, look_ahead_m=look_ahead_m))
