@@ -71,7 +71,12 @@ class AdaptiveCfg:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        for name, low, high in (("window", 4, 1000), ("replan", 1, 1000), ("order", 1, 3), ("patience", 1, 1000)):
+        for name, low, high in (
+            ("window", 4, 1000),
+            ("replan", 1, 1000),
+            ("order", 1, 3),
+            ("patience", 1, 1000),
+        ):
             value = getattr(self, name)
             require(
                 is_number(value) and int(value) == value and low <= value <= high,
@@ -119,7 +124,9 @@ class Path(NamedTuple):
         return np.asarray((n * (n - 1) * self._powers(u)[: len(n)]) @ self.coefficients[2:])
 
     def _powers(self, u: Array | float) -> Array:
-        return np.power.outer(np.asarray(u, dtype=np.float64) - self.origin, np.arange(len(self.coefficients)))
+        return np.power.outer(
+            np.asarray(u, dtype=np.float64) - self.origin, np.arange(len(self.coefficients))
+        )
 
 
 class Track(NamedTuple):

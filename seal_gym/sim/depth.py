@@ -33,8 +33,8 @@ class DepthCfg:
         look_ahead_m: Distance of the line ahead of the tip, where the seam should be [m]. Before the corner of a
             box the line runs off the wall unless the look-ahead is below the corner's radius; welding sensors
             look 10 mm and more ahead, away from the arc, which a sealing gun does not have.
-        origin_m: Where the fan of light leaves the sensor, in the tip frame [m]: by default before the front
-            camera, where it clears cartridge and nozzle.
+        origin_m: Where the fan of light leaves the sensor, in the tip frame [m]: by default in the front
+            camera's place, from where it clears cartridge and nozzle.
         sigma_m: Standard deviation of a point's error along its ray [m].
         dropout: Probability that a point is missing, 0..1.
         max_incidence_rad: Faces met at a larger angle to their normal give no echo [rad].
@@ -44,7 +44,7 @@ class DepthCfg:
     points: int = 160
     width_m: float = 0.025
     look_ahead_m: float = 0.003
-    origin_m: tuple[float, float, float] = (0.0, 0.038, 0.095)
+    origin_m: tuple[float, float, float] = (0.0, 0.046, 0.095)
     sigma_m: float = 5e-5
     dropout: float = 0.02
     max_incidence_rad: float = float(np.deg2rad(80.0))

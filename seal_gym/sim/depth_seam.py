@@ -155,7 +155,7 @@ def split(profile: Array, cfg: SeamPointCfg) -> list[Line]:
             cuts.add(middle)
             spans += [(a, middle), (middle, b)]
     pieces = _merged(profile, sorted(cuts), cfg)
-    return [_line(profile[a : b + 1], cfg.trim) for a, b in pieces if b - a + 1 >= cfg.min_points]
+    return [fit_line(profile[a : b + 1], cfg.trim) for a, b in pieces if b - a + 1 >= cfg.min_points]
 
 
 def _merged(profile: Array, cuts: list[int], cfg: SeamPointCfg) -> list[tuple[int, int]]:
@@ -165,7 +165,7 @@ def _merged(profile: Array, cuts: list[int], cfg: SeamPointCfg) -> list[tuple[in
         if pieces:
             whole = (pieces[-1][0], piece[1])
             stretch = profile[whole[0] : whole[1] + 1]
-            line = _line(stretch, 0)
+            line = fit_line(stretch, 0)
             off = stretch - line.centre
             distance = np.abs(off[:, 0] * line.direction[1] - off[:, 1] * line.direction[0])
             if distance.max() <= cfg.tolerance_m:
@@ -175,8 +175,16 @@ def _merged(profile: Array, cuts: list[int], cfg: SeamPointCfg) -> list[tuple[in
     return pieces
 
 
-def _line(points: Array, trim: int) -> Line:
-    """Total least squares through a stretch without its ends."""
+def fit_line(points: Array, trim: int) -> Line:
+    """Total least squares through a stretch without its ends.
+
+    Args:
+        points: From left to right, shape (n, 2), m.
+        trim: Points left out at either end, fewer than n / 2 - 1.
+
+    Returns:
+        The line.
+    """
     kept = points[trim : len(points) - trim]
     centre = kept.mean(axis=0)
     a, d = (kept - centre).T
@@ -250,7 +258,9 @@ def _plate(profile: Array) -> tuple[Array, float]:
     for _ in range(_TRIMS):
         a, d = profile[kept].T
         centre = np.array([a.mean(), d.mean()])
-        slope = float((a - centre[0]) @ (d - centre[1]) / max(float((a - centre[0]) @ (a - centre[0])), 1e-18))
+        slope = float(
+            (a - centre[0]) @ (d - centre[1]) / max(float((a - centre[0]) @ (a - centre[0])), 1e-18)
+        )
         off = np.abs(profile[:, 1] - centre[1] - slope * (profile[:, 0] - centre[0]))
         kept = off <= max(3.0 * _MAD_TO_SIGMA * float(np.median(off)), 1e-9)
     return centre, slope
