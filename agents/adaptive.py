@@ -1,10 +1,10 @@
-"""The classical adaptive baseline: map the seam ahead of the tip with a laser profile sensor, replan, play back.
+"""The classical adaptive baseline: map the seam ahead with a laser profile sensor, replan, play back.
 
 Manorathna et al. 2014 ("Feature extraction and tracking of a weld joint for adaptive robotic welding"), with
-which Zhou et al. compare themselves (their reference 19, Table 4); formulas.md section 3. Each frame a depth
-profile across the seam gives one point of it, a look-ahead before the tip. Points are gated, moved to the base
-frame and kept. Every few points a polynomial through the last ones becomes the path, which a position servo
-follows at fixed speed. The method takes the part to stand still: when the tip comes to a point, the point is
+which Zhou et al. compare themselves (their reference 19, Table 4). Each frame a depth profile across the
+seam gives one point of it, a look-ahead before the tip. Points are gated, moved to the base frame and kept.
+Every few points a polynomial through the last ones becomes the path, which a position servo follows at
+fixed speed. The method takes the part to stand still: when the tip comes to a point, the point is
 look-ahead / speed old.
 """
 
@@ -293,7 +293,7 @@ def aim(path: Path, at: float, pose: Array, speed_m_s: float, stand_off_m: float
     length = float(np.linalg.norm(slope))
     tangent, bend = slope / length, turn @ path.bend(at) / length**2
     heading = np.array([np.arctan2(tangent[2], tangent[1]), lean_rad, -np.arctan2(tangent[0], tangent[1])])
-    # The tip travels on a parallel of the seam, a stand-off away: on the outside of a bend it has farther to go.
+    # The tip travels on a parallel of the seam: on the outside of a bend it has farther to go.
     rate = speed_m_s / max(1.0 - stand_off_m * bend[2], 0.5)
     turning = rate * np.array([bend[2], 0.0, -bend[0]])
     offset = np.array([seam[0], 0.0, seam[2] + stand_off_m])
@@ -331,9 +331,10 @@ def _saturated(error: Array, limit: float) -> Array:
 class Adaptive:
     """Maps, replans and follows, for every simulation of an environment.
 
-    It reads joint angles, twist and lean from the observation, and its own sensor from the simulation: never the
-    pose of the part or of the seam. Between calls it keeps nothing: its memory is the ``state`` of ``predict``,
-    which must be handed back, and the sensor's noise depends on the episode's seed and the frame alone.
+    It reads joint angles, twist and lean from the observation, and its own sensor from the simulation: never
+    the pose of the part or of the seam. Between calls it keeps nothing: its memory is the ``state`` of
+    ``predict``, which must be handed back, and the sensor's noise depends on the episode's seed and the
+    frame alone.
 
     Attributes:
         control: The ``control`` its environment needs.
@@ -403,7 +404,8 @@ class Adaptive:
         n = len(rows)
         require(
             n == self._core.n,
-            f"observation of {n} simulations: the environment that this policy was made for has {self._core.n}",
+            f"observation of {n} simulations: the environment that this policy was made for has "
+            f"{self._core.n}",
         )
         fresh = self._core.frames == 0
         if episode_start is not None:

@@ -1,7 +1,8 @@
 """A laser profile sensor on the gun: depth across the seam, some millimetres ahead of the tip.
 
-The classical sensor of adaptive sealing and welding (Manorathna et al. 2014, Zhou et al.'s reference 19; with a
-depth sensor in Zhou et al., 4.3). It sees the part's real surfaces through MuJoCo's rays, and nothing else.
+The classical sensor of adaptive sealing and welding (Manorathna et al. 2014, Zhou et al.'s reference 19;
+with a depth sensor in Zhou et al., 4.3). It sees the part's real surfaces through MuJoCo's rays, and
+nothing else.
 """
 
 from collections.abc import Sequence
@@ -22,17 +23,17 @@ _MAX_POINTS = 4096
 class DepthCfg:
     """The sensor.
 
-    The defaults stand for a small laser seam tracker as such devices are sold (a line of about 25 mm at a
-    working distance of about 100 mm, hundreds of points a profile, an error of hundredths of a millimetre), not
-    for one maker's model. Makers state resolutions of micrometres on matt white targets; bare metal scatters
-    more, hence 0.05 mm a point. The profile comes once a frame of the cameras; real sensors are faster.
+    The defaults stand for a small laser seam tracker (a line of about 25 mm at a working distance of about
+    100 mm, hundreds of points a profile), not for one maker's model. Makers state resolutions of micrometres
+    on matt targets (Micro-Epsilon scanCONTROL 29xx-10: 1 um, 1280 points); bare metal scatters more, hence
+    0.05 mm a point. The profile comes once a frame of the cameras; real sensors are faster.
 
     Attributes:
         points: In a profile.
         width_m: Of the line at the distance of the seam [m].
-        look_ahead_m: Distance of the line ahead of the tip, where the seam should be [m]. Before the corner of a
-            box the line runs off the wall unless the look-ahead is below the corner's radius; welding sensors
-            look 10 mm and more ahead, away from the arc, which a sealing gun does not have.
+        look_ahead_m: Distance of the line ahead of the tip, where the seam should be [m]. Before the corner
+            of a box the line runs off the wall unless the look-ahead is below the corner's radius; welding
+            sensors look farther ahead, away from the arc, which a sealing gun does not have.
         origin_m: Where the fan of light leaves the sensor, in the tip frame [m]: by default in the front
             camera's place, from where it clears cartridge and nozzle.
         sigma_m: Standard deviation of a point's error along its ray [m].
@@ -92,9 +93,8 @@ class Profile(NamedTuple):
 class DepthSensor:
     """Measures profiles of N simulations of one scene.
 
-    Sensor frame: origin where the light leaves; x the tip's x, z the axis of the fan; the light stays in y = 0.
-    Only the part and what it stands on are seen: the gun is out of the light's way, and nothing that a wrapper
-    adds to the cell is in it.
+    Sensor frame: origin where the light leaves; x the tip's x, z the axis of the fan; the light stays in
+    y = 0. Only the part and what it stands on are seen: the gun is out of the light's way.
 
     Attributes:
         T_tip_sensor: Shape (4, 4), m.

@@ -1,7 +1,7 @@
 """The seam in a depth profile: the corner of two lines in a fillet, the middle of a groove.
 
-formulas.md section 3, step 2: median filter, split-and-merge into lines, their intersection; or the midpoint of
-the two steepest places.
+Median filter, split and merge into lines, their intersection; or the midpoint of the two steepest places
+(after Manorathna et al. 2014, Zhou et al.'s reference 19).
 """
 
 from dataclasses import dataclass

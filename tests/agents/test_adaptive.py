@@ -271,7 +271,7 @@ def test_it_knows_of_the_part_by_its_sensor_only():
 def test_it_wants_its_environment():
     with pytest.raises(ConfigError, match=r"load_policy\('adaptive', env\)"):
         Adaptive.of(None)
-    with pytest.raises(ConfigError, match="observation of 3 simulations.*has 1"):
+    with pytest.raises(ConfigError, match=r"observation of 3 simulations.*has 1"):
         Adaptive.of(make()).predict(np.zeros((3, 35), np.float32))
 
 
