@@ -72,7 +72,7 @@ class DepthCfg:
             )
         origin = self.origin_m
         require(
-            len(origin) == 3 and all(is_number(v) for v in origin) and origin[2] > 0.01,
+            np.shape(origin) == (3,) and all(is_number(v) for v in origin) and origin[2] > 0.01,
             f"DepthCfg.origin_m = {origin!r}: must be 3 finite numbers, the last > 0.01 (above the mouth)",
         )
 
