@@ -29,7 +29,7 @@ _Y = 1
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptiveCfg:
-    """Sensor, path and servo; the defaults were chosen by ``python -m agents.tune_adaptive``.
+    """Sensor, path and servo; ``python -m agents.tune_adaptive`` compares their settings.
 
     Attributes:
         depth: The sensor.
