@@ -53,25 +53,39 @@ class NamedPolicy:
     make: Callable[["CellCfg | None"], Policy]
 
 
-def _learned(name: str) -> Callable[["CellCfg | None"], Policy]:
+def _pid_servo(cell: "CellCfg | None") -> Policy:
+    from agents.pid_servo import PidServo  # a command line of its own, and imports mujoco
+
+    return PidServo(cell)
+
+
+def _learned(name: str, dagger: int = 0) -> Callable[["CellCfg | None"], Policy]:
+    """Makes a shipped policy; its kind is its name, without ``_dagger``."""
+    kind = name.removesuffix("_dagger")
+    rounds = f" --dagger {dagger} --dagger-episodes 50 --dagger-epochs 6" if dagger else ""
+
     def make(cell: "CellCfg | None") -> Policy:
         path = WEIGHTS / f"{name}.safetensors"
         if not path.is_file():
             raise ConfigError(
                 f"policy {name!r} has no weights in {WEIGHTS.parent.name}/{WEIGHTS.name} yet: collect "
                 "demonstrations with `python -m agents.collect --out DATA`, train with `python -m "
-                f"agents.train_bc --policy {name} --seed 0 --data DATA --out RUN`, and load_policy"
-                f"('RUN/{name}-seed0.safetensors'), or copy that file and its .json there as {path.name}"
+                f"agents.train_bc --policy {kind} --seed 0{rounds} --data DATA --out RUN`, and load_policy"
+                f"('RUN/{kind}-seed0.safetensors'), or copy that file and its .json there as {path.name}"
             )
-        return _from_weights(path, cell)
+        return _from_weights(path, cell, kind)
 
     return make
 
 
-def _from_weights(path: Path, cell: "CellCfg | None") -> Policy:
+def _from_weights(path: Path, cell: "CellCfg | None", kind: str | None = None) -> Policy:
     from agents import policies  # needs torch: only when asked for
 
     policy = policies.load(path)
+    if kind not in (None, policy.cfg.kind):
+        raise policies.PolicyFileError(
+            f"{path.name} holds a policy of kind {policy.cfg.kind!r}: must be {kind!r}; copy the right file"
+        )
     if cell is not None:
         policy.check_cell(cell)
     return policy
@@ -79,29 +93,39 @@ def _from_weights(path: Path, cell: "CellCfg | None") -> Policy:
 
 POLICIES: dict[str, NamedPolicy] = {
     "rmp_expert": NamedPolicy("rmp", RmpExpert),
+    "pid_servo": NamedPolicy("tip", _pid_servo),
     "neural_rmp": NamedPolicy("rmp", _learned("neural_rmp")),
     "neural_rmp_identity": NamedPolicy("rmp", _learned("neural_rmp_identity")),
     "neural_control": NamedPolicy("tip", _learned("neural_control")),
+    "neural_rmp_dagger": NamedPolicy("rmp", _learned("neural_rmp_dagger", 3)),
+    "neural_control_dagger": NamedPolicy("tip", _learned("neural_control_dagger", 3)),
 }
 
 
-def _find(name: str) -> NamedPolicy:
+def _find(name: str, trust_zip: bool = False) -> NamedPolicy:
     """The policy of a name or of a file."""
     if name in POLICIES:
         return POLICIES[name]
     path = Path(name)
     if path.suffix == ".safetensors":
-        from agents import policies
-
-        control = policies.control_in(path)
-        return NamedPolicy(control, lambda cell: _from_weights(path, cell))
+        return _in_weights(path)
     if path.suffix == ".zip":
         from agents import sb3_models
 
-        return NamedPolicy(sb3_models.control_in(path), lambda _: sb3_models.load(path))
+        return NamedPolicy(sb3_models.control_in(path), lambda _: sb3_models.load(path, trust_zip=trust_zip))
     raise ConfigError(
         f"policy = {name!r}: must be one of {sorted(POLICIES)}, or the path of a file {' or '.join(_FILES)}"
     )
+
+
+def _in_weights(path: Path) -> NamedPolicy:
+    """The policy of a file that ``agents.train_bc`` or ``agents.train_sb3`` wrote; its card says which."""
+    from agents import policies, sb3_policies
+
+    if sb3_policies.is_ours(path):
+        trained = sb3_policies.load(path)
+        return NamedPolicy(trained.control, lambda _: trained)
+    return NamedPolicy(policies.control_in(path), lambda cell: _from_weights(path, cell))
 
 
 def control_of(name: str) -> str:
@@ -120,15 +144,17 @@ def control_of(name: str) -> str:
     return _find(name).control
 
 
-def load_policy(name: str, env: Any = None) -> Policy:
-    """A policy by name, or from a file.
+def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Policy:
+    """A policy by name, or from a file. Nothing in a file is executed.
 
     Args:
-        name: One of ``POLICIES``; or the path of weights that ``agents.train_bc`` wrote
-            (``NAME.safetensors``, nothing in it is executed); or of a model that Stable-Baselines3 saved
-            (``NAME.zip``: it can run code as it is loaded, so load only what you trust).
+        name: One of ``POLICIES``; or the path of weights that ``agents.train_bc`` or ``agents.train_sb3``
+            wrote (``NAME.safetensors``); or of a model that Stable-Baselines3 saved (``NAME.zip``), of which
+            the parameters are read and the policy built anew.
         env: The environment it will act in, single or vectorised: checked against the policy's control mode,
             and the source of the cell's calibration.
+        trust_zip: Lets Stable-Baselines3 load a ``.zip``, which can run any code that is in it: for models
+            that cannot be built anew (custom policies, images), from a source you trust.
 
     Returns:
         The policy.
@@ -138,7 +164,7 @@ def load_policy(name: str, env: Any = None) -> Policy:
             cell is another.
         PolicyFileError: If a file is missing, damaged or no policy.
     """
-    found = _find(name)
+    found = _find(name, trust_zip)
     if env is None:
         return found.make(None)
     cfg = getattr(env, "unwrapped", env).core.cfg

@@ -3,8 +3,8 @@
     python -m agents.enjoy --policy rmp_expert --env SealGym/Cylinder-v0 --episodes 3 --video out/expert.mp4
 
 ``--policy`` takes a name (``rmp_expert``, ...), a ``.safetensors`` file of ``agents.train_bc`` or
-``agents.train_sb3`` (or the folder of such a run), or a ``.zip`` that Stable-Baselines3 saved. Only the last
-kind can hold code, which loading would run: open such a file only if you trust where it comes from.
+``agents.train_sb3`` (or the folder of such a run), or a ``.zip`` that Stable-Baselines3 saved. Nothing in
+such a file is executed.
 """
 
 from agents import backend
@@ -33,7 +33,7 @@ def find_policy(name: str) -> Policy:
     """A policy by name or path.
 
     Args:
-        name: As ``agents.load_policy`` takes it; also weights of ``agents.train_sb3``, or a run's folder.
+        name: As ``agents.load_policy`` takes it; also the folder of a run of ``agents.train_sb3``.
 
     Returns:
         The policy.
@@ -41,14 +41,8 @@ def find_policy(name: str) -> Policy:
     Raises:
         SealGymError: If there is none.
     """
-    path = Path(name) / "policy.safetensors" if Path(name).is_dir() else Path(name)
-    if path.suffix == ".safetensors":
-        from agents import sb3_policies
-
-        if sb3_policies.is_ours(path):
-            return sb3_policies.load(path)
-        return agents.load_policy(str(path))
-    return agents.load_policy(name)
+    folder = Path(name)
+    return agents.load_policy(str(folder / "policy.safetensors") if folder.is_dir() else name)
 
 
 def play(
@@ -164,8 +158,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--policy",
         default="rmp_expert",
         help=f"one of {', '.join(sorted(agents.POLICIES))}, a .safetensors file, a run's folder, or a .zip "
-        "of Stable-Baselines3 (loading a .zip can run code in it: only open one you trust); default: "
-        "%(default)s",
+        "of Stable-Baselines3; default: %(default)s",
     )
     parser.add_argument(
         "--env",

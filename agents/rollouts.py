@@ -106,16 +106,17 @@ def _roll_at_once(
     rng = np.random.default_rng([seed, n])
     frames: list[list[FloatRows]] = [[], [], []]
     lengths, live = np.zeros(n, np.int64), np.ones(n, np.bool_)
+    state, start = None, np.ones(n, np.bool_)
     while live.any():
         tip, rmp = label(observation)
-        action, _ = policy.predict(observation)
+        action, state = policy.predict(observation, state=state, episode_start=start)
         theirs = rmp if policy.control == "rmp" else tip
         action = np.where(rng.random((n, 1)) < expert_share, theirs, action)
         for rows, new in zip(frames, (observation, tip, rmp), strict=True):
             rows.append(new)
         lengths += live
-        observation, _, done, _ = venv.step(action)
-        live &= ~done
+        observation, _, start, _ = venv.step(action)
+        live &= ~start
     venv.close()
     stacked = [np.stack(rows) for rows in frames]
     return [Episode(*(rows[: lengths[i], i].copy() for rows in stacked)) for i in range(n)]
@@ -165,9 +166,11 @@ def _episode_metrics(
     venv.seed(seed)
     observation: Any = venv.reset()
     ended: dict[int, dict[str, Any]] = {}
+    state, start = None, np.ones(n, np.bool_)
     while len(ended) < n:
-        observation, _, done, infos = venv.step(policy.predict(observation)[0])
-        for i in map(int, np.flatnonzero(done)):
+        action, state = policy.predict(observation, state=state, episode_start=start)
+        observation, _, start, infos = venv.step(action)
+        for i in map(int, np.flatnonzero(start)):
             ended.setdefault(i, infos[i]["episode_metrics"])
     venv.close()
     return [ended[i] for i in range(n)]

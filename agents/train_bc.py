@@ -17,9 +17,9 @@ epochs and the rules below.
 Rules, fixed beforehand. One episode in ten is held out for validation, the same ones for every kind and seed.
 The weights kept are those of the epoch with the lowest validation loss. Training stops early once that loss
 has not fallen by 1 % for ``--patience`` epochs. With ``--dagger`` the last round's policy is kept. Of several
-training seeds the one to ship is ``best_of``'s: it reached most often on the validation seeds of flat and
-cylinder (``--validate``), and among equals had the smallest RMSE; the rectangular part has no say, it must
-stay unseen.
+training seeds the one to ship is ``agents.ship.best_of``'s: it reached most often on the validation seeds of
+flat and cylinder (``--validate``), and among equals had the smallest RMSE; the rectangular part has no
+say, so that it stays unseen.
 
 DAgger (Ross et al. 2011). In each round the policy acts on flat and cylinder, the expert labels the states it
 visits, in the action space of the kind, and the policy learns on from all the data. The expert never acts in
@@ -68,7 +68,6 @@ from agents.policies import (
     PolicyFileError,
     SealNet,
     check_tensors,
-    load,
     save,
     write_whole,
 )
@@ -547,57 +546,6 @@ def validate(policy: LearnedPolicy, trials: int, perception: str) -> dict[str, A
     return {
         part: rollouts.score(policy, workpiece=part, trials=trials, perception=perception) for part in _PARTS
     }
-
-
-def best_of(cards: Sequence[dict[str, Any]]) -> int:
-    """Which of several training seeds to ship.
-
-    Args:
-        cards: With the ``validation`` that ``--validate`` adds.
-
-    Returns:
-        Index of the one that reached most often; among equals of the one with the smallest mean RMSE.
-
-    Raises:
-        ConfigError: If a card has no such scores.
-    """
-
-    def rank(card: dict[str, Any]) -> tuple[float, float]:
-        scores = list(card.get("validation", {}).values())
-        require(bool(scores), "a card has no validation scores: train with --validate TRIALS")
-        errors = [s["rmse_mm"] for s in scores]
-        reached = sum(s["reached"] / s["trials"] for s in scores)
-        return -reached, np.inf if None in errors else float(np.mean(errors))
-
-    return min(range(len(cards)), key=lambda k: rank(cards[k]))
-
-
-def ship(trained: Sequence[Path], folder: Path) -> Path:
-    """Copies the training seeds of one kind, and the chosen one under the kind's name.
-
-    Args:
-        trained: Files of ``main``, one a training seed.
-        folder: ``agents.WEIGHTS``.
-
-    Returns:
-        The chosen one, where ``agents.load_policy`` finds it.
-
-    Raises:
-        ConfigError: If kinds, data or options differ, or a card has no validation scores.
-        PolicyFileError: If a file is missing or damaged.
-    """
-    found = [load(path) for path in trained]
-    cards = [policy.card for policy in found]
-    alike = ("config", "data_sha256", "dagger", "validation_perception")
-    for card in cards[1:]:
-        other = [k for k in alike if card.get(k) != cards[0].get(k)]
-        require(not other, f"seeds {cards[0]['seed']} and {card['seed']} differ in {other}: train them alike")
-    best = found[best_of(cards)]
-    for policy in found:
-        save(policy, folder / f"{policy.cfg.kind}-seed{policy.card['seed']}.safetensors", policy.card)
-    path = folder / f"{best.cfg.kind}.safetensors"
-    save(best, path, best.card)
-    return path
 
 
 # -- command line ---------------------------------------------------------------------------------------

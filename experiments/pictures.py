@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from seal_gym.core.frames import Array
 from seal_gym.envs.seal_env import SealEnv
+from seal_gym.workpieces.surface import Surface
 
 mpl.use("Agg")  # no screen needed
 import matplotlib.pyplot as plt  # the backend has to be chosen first
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import LogNorm
 
 SPEED_UP = 5
 _STRIP = 176
@@ -24,6 +27,10 @@ _CURVE = (90, 200, 255)
 _TEXT = (235, 235, 235)
 _BACK = (28, 30, 34)
 _BLUE, _RED, _GREY = "#1f5fa8", "#d1382c", "#8a8f98"
+_CLEARANCE_MM = 1.06  # of the mouth to wall and plate
+_ERROR_MM = (0.01, 3.0)  # range of the colours
+_SETTLE_MM = 10.0  # protocol.md: errors count from here
+_SHOWN_POSES = 5
 
 
 class Recorder:
@@ -33,6 +40,8 @@ class Recorder:
         time_s: Of each frame [s].
         tip_mm: Tip in the part's frame, one row a frame [mm].
         error_mm: Tip error of each frame [mm].
+        s_mm: Arc length of the seam's point nearest the tip in each frame [mm].
+        part_pose: ``T_base_part`` of each frame, shape (4, 4), m.
         frames: Pictures, if asked for.
     """
 
@@ -48,6 +57,7 @@ class Recorder:
         self.error_mm: list[float] = []
         self.frames: list[NDArray[np.uint8]] = []
         self.s_mm: list[float] = []
+        self.part_pose: list[Array] = []
         self.desired_mm = np.empty((0, 3))
 
     def __call__(self, env: SealEnv, info: dict[str, Any]) -> None:
@@ -63,7 +73,8 @@ class Recorder:
             sealed = seam.at(np.linspace(0.0, seam.length, 2000))
             self.desired_mm = 1e3 * (sealed.position + stand_off * sealed.approach)
             self._nominal_s = seam.length / core.cfg.cell.process.speed_m_s
-        part = core.arm.part_pose[0]
+        part = core.arm.part_pose[0].copy()
+        self.part_pose.append(part)
         self.time_s.append(core.seconds(0))
         self.tip_mm.append(1e3 * part[:3, :3].T @ (core.tip.pose[0, :3, 3] - part[:3, 3]))
         self.error_mm.append(info["tip_error_mm"])
@@ -139,7 +150,7 @@ class Recorder:
         error.semilogy(
             np.asarray(self.s_mm)[sealing], np.maximum(np.asarray(self.error_mm)[sealing], 1e-4), color=_RED
         )
-        error.axhline(1.06, color=_GREY, ls="--", lw=1)
+        error.axhline(_CLEARANCE_MM, color=_GREY, ls="--", lw=1)
         error.text(
             0.995,
             1.06,
@@ -155,6 +166,100 @@ class Recorder:
             axes.grid(color="#dddddd", lw=0.6)
         figure.savefig(path, dpi=110)
         plt.close(figure)
+
+
+def _draw_part(axes: Any, surface: Surface, pose: Array, alpha: float = 1.0) -> None:
+    """The faces that are seen from above, plate light and wall dark."""
+    up = surface.normals[:, 2] > 0.5
+    order = np.argsort(surface.triangles[up, :, 2].max(axis=1), kind="stable")
+    corners = 1e3 * (surface.triangles[up][order] @ pose[:3, :3].T + pose[:3, 3])
+    shades = np.array(["#dfe3e8", "#a9b2bd"])[np.minimum(surface.material[up][order], 1)]
+    edges = shades.tolist() if alpha == 1.0 else "none"  # overlapping edges would show the triangles
+    style = {"facecolors": shades.tolist(), "edgecolors": edges, "alpha": alpha, "zorder": 0}
+    axes.add_collection(PolyCollection(list(corners[:, :, :2]), **style))
+
+
+def _coloured(axes: Any, points: Array, values: Array, norm: Any, width: float) -> LineCollection:
+    """A path coloured by a value at each point."""
+    pieces = np.stack((points[:-1, :2], points[1:, :2]), axis=1)
+    path = LineCollection(list(pieces), cmap="turbo", norm=norm, linewidths=width, capstyle="round", zorder=3)
+    path.set_array(values[1:])
+    axes.add_collection(path)
+    return path
+
+
+def plot_on_part(path: Path, title: str, surface: Surface, run: Recorder) -> None:
+    """Draws the tip error on the part, as Zhou et al., Fig. 14: the tip's path in the moving part's frame.
+
+    Args:
+        path: The PNG file.
+        title: Above the plots.
+        surface: The part.
+        run: A recorded run.
+    """
+    tip, error, time = np.asarray(run.tip_mm), np.asarray(run.error_mm), np.asarray(run.time_s)
+    poses = np.asarray(run.part_pose)
+    sealing = np.asarray(run.s_mm) >= _SETTLE_MM
+    first = int(np.argmax(sealing)) if sealing.any() else len(tip) - 1
+    figure = plt.figure(figsize=(13.0, 8.6), constrained_layout=True)
+    figure.suptitle(title, fontsize=13)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1.0), height_ratios=(1.5, 1.0))
+    on_part, cell, course = (
+        figure.add_subplot(grid[0:2, 0]),
+        figure.add_subplot(grid[0, 1]),
+        figure.add_subplot(grid[1, 1]),
+    )
+
+    _draw_part(on_part, surface, np.eye(4))
+    on_part.plot(
+        *tip[: first + 1, :2].T, color=_GREY, lw=1.2, ls=":", label="approach, not counted", zorder=2
+    )
+    norm = LogNorm(*_ERROR_MM, clip=True)
+    line = _coloured(on_part, tip[first:], error[first:], norm, 6.0)
+    on_part.plot(*tip[0, :2], "o", color=_GREY, ms=6, label="start", zorder=4)
+    on_part.plot(*tip[-1, :2], "s", color="black", ms=6, label="end", zorder=4)
+    rms = np.sqrt(np.mean(error[first:] ** 2))
+    on_part.set(
+        title=f"the tip's path on the part: RMS error {rms:.3f} mm, largest {error[first:].max():.3f} mm",
+        xlabel="x of the part [mm]",
+        ylabel="y of the part [mm]",
+    )
+    bar = figure.colorbar(line, ax=on_part, location="bottom", shrink=0.8, aspect=35, pad=0.02)
+    bar.set_label("tip error [mm]; line: the nozzle's clearance to wall and plate, 1.06 mm")
+    bar.ax.axvline(_CLEARANCE_MM, color="black", lw=1.2)
+    bar.set_ticks([0.01, 0.1, 1.0], labels=["0.01 or less", "0.1", "1"])
+    on_part.legend(loc="upper right", fontsize=9)
+
+    for k, share in enumerate(np.linspace(0.0, 1.0, _SHOWN_POSES)):
+        _draw_part(cell, surface, poses[round(share * (len(poses) - 1))], alpha=0.15 + 0.1 * k)
+    ends = (tip[..., None, :] @ np.swapaxes(poses[:, :3, :3], 1, 2))[:, 0] + 1e3 * poses[:, :3, 3]
+    cell.plot(*ends[:, :2].T, color=_RED, lw=1.5, label="tip")
+    cell.plot(*(1e3 * poses[:, :2, 3].T), color=_BLUE, lw=1.5, label="the part's origin")
+    yaw = np.rad2deg(np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0])))
+    shift = 1e3 * np.linalg.norm(poses[:, :2, 3] - poses[0, :2, 3], axis=1).max()
+    turned = np.abs(yaw - yaw[0]).max()
+    cell.set(
+        title=f"in the cell: the part moves by up to {shift:.0f} mm and {turned:.0f} deg",
+        xlabel="x of the robot's base [mm]",
+        ylabel="y [mm]",
+    )
+    cell.legend(loc="best", fontsize=9)
+    for axes in (on_part, cell):
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.autoscale_view()
+
+    course.semilogy(time[first:], np.maximum(error[first:], 1e-3), color=_RED, lw=1.2)
+    course.axhline(_CLEARANCE_MM, color=_GREY, ls="--", lw=1)
+    course.set(title="tip error and the part's speed", xlabel="time [s]", ylabel="tip error [mm]")
+    course.yaxis.label.set_color(_RED)
+    speed = np.linalg.norm(np.diff(1e3 * poses[:, :3, 3], axis=0), axis=1) / np.diff(time)
+    beside = course.twinx()
+    beside.plot(time[1:], speed, color=_BLUE, lw=1.0, alpha=0.8)
+    beside.set_ylabel("speed of the part's origin [mm/s]", color=_BLUE)
+    beside.set_ylim(bottom=0.0)
+    course.grid(color="#dddddd", lw=0.6)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,5 +1,6 @@
 """A run as a Rerun recording: images and marks, features over time, the gun and its leaves in 3D."""
 
+from collections.abc import Sequence
 from datetime import timedelta
 from importlib import import_module
 from importlib.util import find_spec
@@ -109,14 +110,19 @@ class Writer:
         path: The .rrd file.
         name: Of the recording.
         scene: The run's part, cell and nozzle.
+
+    Attributes:
+        about: What the viewer shows as text.
     """
+
+    about = ABOUT
 
     def __init__(self, path: Path, name: str, scene: Scene) -> None:
         self._rr: Any = import_module("rerun")
         batches = self._rr.ChunkBatcherConfig()
         batches.flush_tick = timedelta(seconds=5)  # small batches would double the file
         self._stream = self._rr.RecordingStream("seal_gym_inspect", recording_id=name, batcher_config=batches)
-        self._stream.save(path, default_blueprint=_blueprint(scene))
+        self._stream.save(path, default_blueprint=self._layout(scene))
         self._leaf_names: set[str] = set()
         self._times: list[float] = []
         self._scalars: dict[str, list[float]] = {}
@@ -125,11 +131,15 @@ class Writer:
         self._part: Array | None = None
         self._static(scene)
 
+    def _layout(self, scene: Scene) -> Any:
+        """How the viewer opens."""
+        return blueprint(scene, _plots())
+
     # -- what does not change ---------------------------------------------------------------------------
 
     def _static(self, scene: Scene) -> None:
         rr, part = self._rr, scene.workpiece
-        self._fixed("about", rr.TextDocument(ABOUT, media_type=rr.MediaType.MARKDOWN))
+        self._fixed("about", rr.TextDocument(self.about, media_type=rr.MediaType.MARKDOWN))
         self._fixed("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         rgb = np.array([m.rgb for m in MATERIALS])[part.surface.material]
         self._mesh("world/part/surface", part.surface.triangles, np.round(255 * rgb).astype(np.uint8))
@@ -273,8 +283,7 @@ class Writer:
             if not block.any() and entity not in self._leaf_names:
                 continue  # the leaf does not act here
             self._leaf_names.add(entity)
-            vector = scale * leaf.accel[0, part]
-            self._stream.log(f"{entity}/accel", rr.Arrows3D(vectors=[vector], colors=[colour], radii=[3e-4]))
+            self._arrow(f"{entity}/accel", scale * leaf.accel[0, part], colour)
             half, quaternion = ellipsoid(block)
             self._stream.log(
                 f"{entity}/metric",
@@ -288,6 +297,10 @@ class Writer:
                     show_labels=False,
                 ),
             )
+
+    def _arrow(self, entity: str, vector: Array, colour: tuple[int, int, int]) -> None:
+        arrow = self._rr.Arrows3D(vectors=[vector], colors=[colour], radii=[3e-4])
+        self._stream.log(entity, arrow)
 
     # -- the end ----------------------------------------------------------------------------------------
 
@@ -310,8 +323,16 @@ class Writer:
         self._stream.disconnect()
 
 
-def _blueprint(scene: Scene) -> Any:
-    """How the viewer opens: the ROIs left, the cell and the leaves in the middle, the plots right."""
+def blueprint(scene: Scene, plots: Sequence[Any]) -> Any:
+    """How the viewer opens: the ROIs left, the cell and the leaves in the middle, the plots right.
+
+    Args:
+        scene: The run's part, cell and nozzle.
+        plots: Views for the right column.
+
+    Returns:
+        A ``rerun.blueprint.Blueprint``.
+    """
     b = import_module("rerun.blueprint")
     rois = b.Vertical(
         b.Spatial2DView(origin="front", name="front"),
@@ -338,6 +359,22 @@ def _blueprint(scene: Scene) -> Any:
         eye_controls=_eye(scene, b),
         line_grid=False,
     )
+    return b.Blueprint(
+        b.Horizontal(
+            rois,
+            b.Vertical(cell, b.Horizontal(*leaves), row_shares=[1.3, 1.0]),
+            b.Vertical(*plots),
+            column_shares=[1.0, 1.5, 1.3],
+        ),
+        b.TimePanel(state="collapsed", timeline="time"),
+        b.SelectionPanel(state="collapsed"),
+        b.BlueprintPanel(state="collapsed"),
+    )
+
+
+def _plots() -> list[Any]:
+    """Features, the tip's error, the leaves and the images' quality over time."""
+    b = import_module("rerun.blueprint")
     plots = [
         b.TimeSeriesView(
             origin=f"features/{name}_{view}_{unit}",
@@ -351,26 +388,20 @@ def _blueprint(scene: Scene) -> Any:
     plots.append(
         b.TimeSeriesView(origin="tip/error_mm", name="tip error [mm]", axis_y=b.ScalarAxis(range=(0.0, 0.5)))
     )
-    tabs = b.Tabs(
-        b.TimeSeriesView(
-            origin="accel/translation_m_s2", name="leaves [m/s^2]", axis_y=b.ScalarAxis(range=(0.0, 0.15))
-        ),
-        b.TimeSeriesView(
-            origin="accel/rotation_rad_s2", name="leaves [rad/s^2]", axis_y=b.ScalarAxis(range=(0.0, 10.0))
-        ),
-        b.TimeSeriesView(origin="quality", name="valid, SNR [dB]"),
+    plots.append(
+        b.Tabs(
+            b.TimeSeriesView(
+                origin="accel/translation_m_s2", name="leaves [m/s^2]", axis_y=b.ScalarAxis(range=(0.0, 0.15))
+            ),
+            b.TimeSeriesView(
+                origin="accel/rotation_rad_s2",
+                name="leaves [rad/s^2]",
+                axis_y=b.ScalarAxis(range=(0.0, 10.0)),
+            ),
+            b.TimeSeriesView(origin="quality", name="valid, SNR [dB]"),
+        )
     )
-    return b.Blueprint(
-        b.Horizontal(
-            rois,
-            b.Vertical(cell, b.Horizontal(*leaves), row_shares=[1.3, 1.0]),
-            b.Vertical(*plots, tabs),
-            column_shares=[1.0, 1.5, 1.3],
-        ),
-        b.TimePanel(state="collapsed", timeline="time"),
-        b.SelectionPanel(state="collapsed"),
-        b.BlueprintPanel(state="collapsed"),
-    )
+    return plots
 
 
 def _eye(scene: Scene, blueprint: Any) -> Any:

@@ -5,6 +5,8 @@ import json
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,13 @@ _STACK = (
     "stable-baselines3",
 )
 _BOOTSTRAPS = 2000
+FIRST_PUBLISHED_SEED = 1_000_000  # protocol.md: each run on these is logged
+LOG = Path(__file__).resolve().parent / "results" / "LOG.md"
+_LOG_HEAD = (
+    "# Runs on the seeds of published tables\n\n"
+    "Tuning and model choice use other seeds; these (1,000,000 on) are run once a release.\n\n"
+    "| date | commit | command | tables |\n| --- | --- | --- | --- |\n"
+)
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
@@ -68,7 +77,7 @@ def _mean(values: list[float]) -> float | None:
 
 
 def summarise(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row for each method and workpiece, in order of first appearance.
+    """One row for each method, training seed and workpiece, in order of first appearance.
 
     Args:
         trials: Rows of ``trials.run``.
@@ -76,17 +85,18 @@ def summarise(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
     Returns:
         Rows as protocol.md names them.
     """
-    cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    cells: dict[tuple[str, str, int | None], list[dict[str, Any]]] = {}
     for trial in trials:
-        cells.setdefault((trial["method"], trial["workpiece"]), []).append(trial)
+        cell_of = (trial["method"], trial["workpiece"], trial["training_seed"])
+        cells.setdefault(cell_of, []).append(trial)
     rows = []
-    for (method, part), cell in cells.items():
+    for (method, part, training_seed), cell in cells.items():
         row: dict[str, Any] = {
             "method": method,
             "workpiece": part,
             "trials": len(cell),
             "seed0": min(t["seed"] for t in cell),
-            "training_seed": cell[0]["training_seed"],
+            "training_seed": training_seed,
         }
         for name in ("reached", "collision", "timeout"):
             count = sum(bool(t[name]) for t in cell)
@@ -136,6 +146,51 @@ def commit() -> str | None:
     return run.stdout.strip() if run.returncode == 0 else None
 
 
+def dirty() -> bool:
+    """Whether tracked files of the checkout differ from its commit.
+
+    Returns:
+        False outside a repository too.
+    """
+    root = Path(__file__).resolve().parents[1]
+    run = subprocess.run(
+        ["git", "-C", str(root), "status", "--porcelain", "--untracked-files=no"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return run.returncode == 0 and bool(run.stdout.strip())
+
+
+def command(name: str) -> str:
+    """The command line of this process.
+
+    Args:
+        name: Of the experiment.
+
+    Returns:
+        For a shell.
+    """
+    return shlex.join(["python", "-m", f"experiments.{name}", *sys.argv[1:]])
+
+
+def log_run(name: str, tables: str, last_seed: int) -> None:
+    """Notes a run on the seeds of published tables in ``LOG``; others it passes over.
+
+    Args:
+        name: Of the experiment.
+        tables: That the run makes.
+        last_seed: The largest of its seeds.
+    """
+    if last_seed < FIRST_PUBLISHED_SEED:
+        return
+    LOG.parent.mkdir(parents=True, exist_ok=True)
+    text = LOG.read_text(encoding="utf-8") if LOG.exists() else _LOG_HEAD
+    where = f"{commit() or 'no repository'}{' with changes' if dirty() else ''}"
+    line = f"| {datetime.now(UTC):%Y-%m-%d %H:%M} UTC | {where} | `{command(name)}` | {tables} |\n"
+    LOG.write_text(text + line, encoding="utf-8")
+
+
 def write(
     out: Path,
     name: str,
@@ -145,6 +200,7 @@ def write(
     renderer: str,
     regime: str,
     text: str | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes ``<name>.json``, ``.csv`` and ``.md``.
 
@@ -156,25 +212,36 @@ def write(
         renderer: Of the sensor images, or ``"none"`` with oracle features.
         regime: ``"static"`` or ``"dynamic"``.
         text: Markdown for people; by default ``table`` of the rows, which are then a control table's.
+        more: Further entries of the JSON, before the trials.
     """
-    arguments = [a for a in sys.argv[1:]]
     document = {
         "name": name,
         "version": seal_gym.__version__,
-        "command": shlex.join(["python", "-m", f"experiments.{name}", *arguments]),
+        "command": command(name),
         "git_commit": commit(),
         "stack": stack(),
         "renderer": renderer,
         "regime": regime,
         "rows": rows,
+        **(more or {}),
         "trials": trials,
     }
     (out / f"{name}.json").write_text(document_text(document), encoding="utf-8")
-    with (out / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+    write_csv(out / f"{name}.csv", rows)
+    (out / f"{name}.md").write_text((text or table(rows, markdown=True)) + "\n", encoding="utf-8")
+
+
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes rows with the columns of the first.
+
+    Args:
+        path: The file.
+        rows: At least one.
+    """
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    (out / f"{name}.md").write_text((text or table(rows, markdown=True)) + "\n", encoding="utf-8")
 
 
 def document_text(document: dict[str, Any]) -> str:
@@ -196,13 +263,32 @@ def document_text(document: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
+    """A number for people.
+
+    Args:
+        value: The number.
+        digits: After the point.
+
+    Returns:
+        Text, ``-`` for None.
+    """
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _with_interval(row: dict[str, Any], key: str, digits: int) -> str:
-    text = _number(row[key], digits)
-    interval = row[f"{key.removesuffix('_pct')}_ci" if key.endswith("_pct") else f"{key}_ci"]
+def with_interval(row: dict[str, Any], key: str, digits: int) -> str:
+    """A number of a row with its interval.
+
+    Args:
+        row: From ``summarise``, or with entries named likewise.
+        key: Of the number; its interval is ``<key>_ci``, without ``_pct``.
+        digits: After the point.
+
+    Returns:
+        Text.
+    """
+    text = number(row[key], digits)
+    interval = row[f"{key.removesuffix('_pct')}_ci"]
     return text if interval is None else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
 
 
@@ -216,31 +302,38 @@ def table(rows: list[dict[str, Any]], *, markdown: bool = False) -> str:
     Returns:
         Text.
     """
-    head = [
-        "method",
-        "workpiece",
-        "trials",
-        "reached %",
-        "collision %",
-        "timeout %",
-        "RMSE mm",
-        "coverage %",
-        "time s",
-    ]
+    seeds = any(row["training_seed"] is not None for row in rows)
+    head = ["method", *(["training seed"] if seeds else []), "workpiece", "trials"]
+    head += ["reached %", "collision %", "timeout %", "RMSE mm", "coverage %", "time s"]
     body = [
         [
             row["method"],
+            *([number(row["training_seed"], 0)] if seeds else []),
             row["workpiece"],
             str(row["trials"]),
-            _with_interval(row, "reached_pct", 1),
-            _with_interval(row, "collision_pct", 1),
-            _with_interval(row, "timeout_pct", 1),
-            _with_interval(row, "rmse_mm", 4),
-            _number(row["coverage_pct"], 1),
-            _with_interval(row, "time_s", 2),
+            with_interval(row, "reached_pct", 1),
+            with_interval(row, "collision_pct", 1),
+            with_interval(row, "timeout_pct", 1),
+            with_interval(row, "rmse_mm", 4),
+            number(row["coverage_pct"], 1),
+            with_interval(row, "time_s", 2),
         ]
         for row in rows
     ]
+    return grid(head, body, markdown=markdown)
+
+
+def grid(head: list[str], body: list[list[str]], *, markdown: bool = True) -> str:
+    """Cells in columns.
+
+    Args:
+        head: Titles of the columns.
+        body: Rows of cells.
+        markdown: With Markdown's rules.
+
+    Returns:
+        Text.
+    """
     widths = [max(len(line[k]) for line in [head, *body]) for k in range(len(head))]
     rule = ["-" * w for w in widths]
     left, between, right = ("| ", " | ", " |") if markdown else ("", "  ", "")

@@ -4,26 +4,47 @@ import hashlib
 import json
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import seeding
 from tqdm import tqdm
 
 import agents
 import seal_gym
-from experiments import results
-from seal_gym.core.errors import SeamError
+from experiments import results, shapes
+from seal_gym.core.errors import ConfigError, SeamError
+from seal_gym.core.frames import Array
+from seal_gym.envs.config import SealCfg
+from seal_gym.envs.core import SealCore
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.workpieces.catalogue import NAMES
 from seal_gym.workpieces.workpiece import Workpiece
 
+Row = dict[str, Any]
 Observer = Callable[[SealEnv, dict[str, Any]], None]
+TOGETHER = 25
+"""Trials that a worker runs as one batch, and that are logged together."""
+_SIMULATIONS = 5  # at once: a divisor of TOGETHER, so that none idles; more save little time
+_PATH_EVERY = 3  # frames, about 1 mm of the seam
+# They say which trials to run, or turn their rows into tables and pictures: no row depends on them.
+_NO_ROW_DEPENDS_ON = (
+    "demo.py",
+    "learning_curves.py",
+    "pictures.py",
+    "results.py",
+    "table3.py",
+    "table3_figures.py",
+    "table3_report.py",
+)
+_SOURCES = (".py", ".xml", ".toml")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +53,19 @@ class Trial:
 
     Attributes:
         method: Name of the policy.
-        workpiece: Name of a nominal part, or path of a CSV file with a seam.
+        workpiece: Name of a nominal part or of one of ``shapes``, or path of a CSV file with a seam.
         seed: Seed of the environment.
         env: Further keyword arguments of the environment.
+        weights: File of the policy's weights; by default those that ``agents.load_policy`` takes.
+        training_seed: Of these weights.
     """
 
     method: str
     workpiece: str
     seed: int
     env: dict[str, Any] = field(default_factory=dict)
+    weights: str | None = None
+    training_seed: int | None = None
 
     @property
     def part(self) -> str:
@@ -56,20 +81,31 @@ class Trial:
         Returns:
             Environment id, keyword arguments and seed, ready for JSON.
         """
-        part: Any = self.workpiece
-        if part.endswith(".csv"):
-            points, approach = read_seam(Path(part))
-            part = {"points_m": points.tolist(), "approach": approach.tolist(), "name": self.part}
         return {
             "id": "SealGym/Seal-v0",
-            "workpiece": part,
+            "workpiece": _part_spec(self.workpiece, self.part),
             "kwargs": {**self.env, "control": agents.control_of(self.method)},
             "seed": self.seed,
             "version": seal_gym.__version__,
         }
 
 
-Worker = Callable[[Trial], dict[str, Any]]
+Worker = Callable[[Trial], Row]
+
+
+def _part_spec(name: str, shown: str) -> str | dict[str, Any]:
+    """A nominal part's name; of any other everything it is built from."""
+    shape = _shape(name, shown)
+    return name if shape is None else shape.spec()
+
+
+def _shape(name: str, shown: str) -> shapes.Shape | None:
+    if name in shapes.NAMES:
+        return shapes.get(name)
+    if not name.endswith(".csv"):
+        return None
+    points, approach = read_seam(Path(name))
+    return shapes.Shape(name=shown, points=points, approach=approach)
 
 
 def read_seam(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +165,7 @@ def _number(cell: str) -> float | None:
 
 @lru_cache(maxsize=1)
 def code() -> str:
-    """Hash of everything a trial runs on besides its specification: sources, assets and packages.
+    """Hash of everything a trial runs on besides its specification and weights: sources, assets, packages.
 
     Returns:
         Sixteen hexadecimal digits.
@@ -138,14 +174,32 @@ def code() -> str:
     digest = hashlib.sha256(json.dumps(results.stack(), sort_keys=True).encode())
     for folder in ("agents", "assets", "experiments", "seal_gym"):
         for file in sorted((root / folder).rglob("*")):
-            if file.suffix in (".py", ".xml", ".toml"):
+            if file.suffix in _SOURCES and not (folder == "experiments" and file.name in _NO_ROW_DEPENDS_ON):
                 digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=256)
+def code_of(source: str) -> str:
+    """Hash of everything that a policy's trials run on, its weights included, and no other policy's.
+
+    Args:
+        source: Name of the policy, or file of its weights.
+
+    Returns:
+        Sixteen hexadecimal digits.
+    """
+    file = Path(source) if Path(source).suffix else agents.WEIGHTS / f"{source}.safetensors"
+    digest = hashlib.sha256(code().encode())
+    # Whatever stands beside the weights under their name: the card, or gains in a file of their own.
+    for beside in sorted(file.parent.glob(f"{file.stem}.*")):
+        digest.update(beside.name.encode() + beside.read_bytes())
     return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=32)
 def workpiece(name: str) -> str | Workpiece:
-    """A nominal part's name, or the workpiece of a seam file.
+    """A nominal part's name, or the workpiece of a shape or a seam file.
 
     Args:
         name: As in ``Trial``.
@@ -153,10 +207,56 @@ def workpiece(name: str) -> str | Workpiece:
     Returns:
         What the environment's ``workpiece`` takes.
     """
-    if not name.endswith(".csv"):
-        return name
-    points, approach = read_seam(Path(name))
-    return Workpiece.from_polyline(points, approach, name=Path(name).stem)
+    shape = _shape(name, Path(name).stem)
+    return name if shape is None else shape.workpiece()
+
+
+def rebuild(spec: dict[str, Any], environments: Iterable[dict[str, Any]] = ()) -> gym.Env[Any, Any]:
+    """Makes the environment of a trial again.
+
+    Args:
+        spec: A trial's ``env_spec``; reset the environment with its ``seed``.
+        environments: The document's, if the trials name one of them.
+
+    Returns:
+        The environment.
+
+    Raises:
+        ConfigError: If the environment that it names is not there.
+    """
+    if "environment" in spec:
+        found = [e for e in environments if e["environment"] == spec["environment"]]
+        if len(found) != 1:
+            raise ConfigError(
+                f"environment {spec['environment']!r} is there {len(found)} times: give the document's "
+                '"environments"'
+            )
+        spec = found[0]
+    part = spec["workpiece"]
+    built = part if isinstance(part, str) else shapes.Shape.of_spec(part).workpiece()
+    return gym.make(spec["id"], workpiece=built, disable_env_checker=True, **spec["kwargs"])
+
+
+def shared(rows: Iterable[Row]) -> tuple[list[dict[str, Any]], list[Row]]:
+    """Rows that name their environment instead of describing it each for itself.
+
+    Args:
+        rows: Of trials.
+
+    Returns:
+        The environments, for ``rebuild``; and the rows, whose ``env_spec`` has ``environment`` and ``seed``.
+    """
+    names: dict[str, str] = {}
+    environments: list[dict[str, Any]] = []
+    light = []
+    for row in rows:
+        spec = {k: v for k, v in row["env_spec"].items() if k != "seed"}
+        key = json.dumps(spec, sort_keys=True)
+        if key not in names:
+            names[key] = f"{row['workpiece']}-{len(names)}"
+            environments.append({"environment": names[key], **spec})
+        light.append({**row, "env_spec": {"environment": names[key], "seed": row["env_spec"]["seed"]}})
+    return environments, light
 
 
 @lru_cache(maxsize=8)
@@ -184,7 +284,7 @@ def run(trial: Trial, observer: Observer | None = None, render_mode: str | None 
     """
     control = agents.control_of(trial.method)
     env = _environment(trial.workpiece, control, json.dumps(trial.env, sort_keys=True), render_mode)
-    policy = agents.load_policy(trial.method, env)
+    policy = agents.load_policy(trial.weights or trial.method, env)
     core = env.unwrapped
     assert isinstance(core, SealEnv)
     observation, info = env.reset(seed=trial.seed)
@@ -197,79 +297,178 @@ def run(trial: Trial, observer: Observer | None = None, render_mode: str | None 
         start, done = np.array([False]), terminated or truncated
         if observer:
             observer(core, info)
-    metrics = info["episode_metrics"]
+    return _row(trial, info["episode_metrics"])
+
+
+def _row(trial: Trial, metrics: dict[str, Any]) -> Row:
     return {
         "method": trial.method,
         "workpiece": trial.part,
         "seed": trial.seed,
-        "training_seed": None,
+        "training_seed": trial.training_seed,
         **{k: (None if isinstance(v, float) and np.isnan(v) else v) for k, v in metrics.items()},
         "env_spec": trial.spec(),
     }
 
 
+@lru_cache(maxsize=2)
+def _core(part: str, control: str, kwargs: str, n: int) -> SealCore:
+    return SealCore(SealCfg.of(workpiece=workpiece(part), control=control, **json.loads(kwargs)), n)
+
+
+def _tips_mm(core: SealCore) -> Array:
+    """The tips in the parts' frames, shape (N, 3), mm."""
+    part = core.arm.part_pose
+    offset = core.tip.pose[:, :3, 3] - part[:, :3, 3]
+    return np.asarray(1e3 * np.einsum("nji,nj->ni", part[:, :3, :3], offset))
+
+
+def run_together(batch: Sequence[Trial]) -> list[Row]:
+    """Runs trials that differ in their seed alone, several at once: to the bit as ``run`` one by one.
+
+    Args:
+        batch: What to run, at least one.
+
+    Returns:
+        One row a trial in the same order, with ``path_mm``: the tip in the part's frame, sampled along the
+            run, rounded to 1 um.
+    """
+    first, n = batch[0], min(len(batch), _SIMULATIONS)
+    kwargs = json.dumps(first.env, sort_keys=True)
+    core = _core(first.workpiece, agents.control_of(first.method), kwargs, n)
+    policy = agents.load_policy(first.weights or first.method, SimpleNamespace(core=core))
+    paths: list[list[Array]] = [[] for _ in batch]
+    ended: dict[int, Row] = {}
+    waiting = iter(range(n, len(batch)))
+    which: list[int | None] = list(range(n))
+
+    def start(i: int, trial: Trial) -> None:
+        core.reset(i, seeding.np_random(trial.seed)[0])
+
+    for i in range(n):
+        start(i, batch[i])
+    state, starts = None, np.ones(n, np.bool_)
+    observation = core.observe()
+    while True:
+        tips = _tips_mm(core)
+        for i, k in enumerate(which):
+            if k is not None and core.frames[i] % _PATH_EVERY == 0:
+                paths[k].append(tips[i])
+        action, state = policy.predict(observation, state=state, episode_start=starts)
+        result = core.step(action)
+        starts = result.terminated | result.timeout
+        tips = _tips_mm(core)
+        for i in map(int, np.flatnonzero(starts)):
+            k = which[i]
+            if k is not None:
+                paths[k].append(tips[i])
+                path = np.round(paths[k], 3).tolist()
+                ended[k] = {**_row(batch[k], core.episode_metrics(i, result)), "path_mm": path}
+            # With nothing left to do, the simulation goes on with any trial: nobody looks.
+            k = which[i] = next(waiting, None)
+            start(i, batch[k or 0])
+        if len(ended) == len(batch):
+            return [ended[k] for k in range(len(batch))]
+        observation = core.observe()
+
+
 def run_all(
-    trials: Iterable[Trial], *, jobs: int, log: Path, title: str, work: Worker | None = None
-) -> list[dict[str, Any]]:
-    """Runs trials that are not in the log yet, and logs each as it ends.
+    trials: Iterable[Trial],
+    *,
+    jobs: int,
+    log: Path,
+    title: str,
+    work: Worker | None = None,
+    together: int = 1,
+) -> list[Row]:
+    """Runs trials that are not in the log yet, and logs each, or each batch, as it ends.
 
     Args:
         trials: What to run.
         jobs: Processes.
-        log: A file of JSON lines; what is in it with the same specification, from the same code and
-            packages, is not run again.
+        log: A file of JSON lines; what is in it with the same specification, from the same code, weights
+            and packages, is not run again.
         title: Of the progress bar.
         work: What makes a row with ``method`` and ``env_spec`` of a trial, picklable; ``run`` by default.
+        together: Trials in a batch; above 1 they run as ``run_together`` has it, without ``work``.
 
     Returns:
         One row a trial, in the order of ``trials``.
     """
     wanted = list(trials)
+    code_of.cache_clear()  # weights may have been trained since
     done = _read_log(log)
-    missing = [t for t in wanted if _key(t.method, t.spec()) not in done]
-    with log.open("a", encoding="utf-8") as file:
-        for row in tqdm(
-            _results(missing, jobs, work or run),
-            total=len(wanted),
-            initial=len(wanted) - len(missing),
-            desc=title,
-            unit="trial",
-        ):
-            done[_key(row["method"], row["env_spec"])] = row
-            file.write(json.dumps({"code": code(), **row}) + "\n")
+    missing = [t for t in wanted if _key(t) not in done]
+    batches = _batches(missing, together)
+    work_all = run_together if together > 1 else partial(_one_by_one, work or run)
+    with (
+        log.open("a", encoding="utf-8") as file,
+        tqdm(total=len(wanted), initial=len(wanted) - len(missing), desc=title, unit="trial") as bar,
+    ):
+        for batch, rows in _results(batches, jobs, work_all):
+            for trial, row in zip(batch, rows, strict=True):
+                done[_key(trial)] = row
+                file.write(json.dumps({"code": _code(trial), **row}) + "\n")
             file.flush()
-    return [done[_key(t.method, t.spec())] for t in wanted]
+            bar.update(len(batch))
+    return [done[_key(t)] for t in wanted]
 
 
-def _results(trials: list[Trial], jobs: int, work: Worker) -> Iterator[dict[str, Any]]:
-    if jobs <= 1 or len(trials) <= 1:
-        yield from map(work, trials)
+def _batches(trials: Sequence[Trial], size: int) -> list[list[Trial]]:
+    """Trials that differ in their seed alone, at most ``size`` together, in order of first appearance."""
+    alike: dict[str, list[Trial]] = {}
+    for t in trials:
+        what = [t.method, t.weights, t.training_seed, t.workpiece, t.env]
+        alike.setdefault(json.dumps(what, sort_keys=True), []).append(t)
+    return [group[k : k + size] for group in alike.values() for k in range(0, len(group), size)]
+
+
+def _one_by_one(work: Worker, batch: Sequence[Trial]) -> list[Row]:
+    return [work(trial) for trial in batch]
+
+
+def _results(
+    batches: list[list[Trial]], jobs: int, work: Callable[[Sequence[Trial]], list[Row]]
+) -> Iterator[tuple[list[Trial], list[Row]]]:
+    if jobs <= 1 or len(batches) <= 1:
+        for batch in batches:
+            yield batch, work(batch)
         return
     # Fresh processes: a forked one would share OpenGL contexts and threads with this one.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(trials)), mp_context=context, initializer=_one_thread) as pool:
-        for future in as_completed([pool.submit(work, t) for t in trials]):
-            yield future.result()
+    with ProcessPoolExecutor(min(jobs, len(batches)), mp_context=context, initializer=_one_thread) as pool:
+        running = {pool.submit(work, batch): batch for batch in batches}
+        for future in as_completed(running):
+            yield running[future], future.result()
 
 
 def _one_thread() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
-def _key(method: str, spec: dict[str, Any]) -> str:
-    return json.dumps([method, spec], sort_keys=True)
+def _code(trial: Trial) -> str:
+    return code_of(trial.weights or trial.method)
 
 
-def _read_log(log: Path) -> dict[str, dict[str, Any]]:
-    if not log.exists():
-        return {}
+def _key(trial: Trial) -> str:
+    return _key_of(_code(trial), trial.method, trial.training_seed, trial.spec())
+
+
+def _key_of(code: str | None, method: str, training_seed: int | None, spec: dict[str, Any]) -> str:
+    return json.dumps([code, method, training_seed, spec], sort_keys=True)
+
+
+def _read_log(log: Path) -> dict[str, Row]:
+    text = log.read_text(encoding="utf-8") if log.exists() else ""
+    if text and not text.endswith("\n"):  # cut off by a kill: what comes next needs a line of its own
+        with log.open("a", encoding="utf-8") as file:
+            file.write("\n")
     rows = {}
-    for line in log.read_text(encoding="utf-8").splitlines():
+    for line in text.splitlines():
         try:
             row = json.loads(line)
         except json.JSONDecodeError:
             continue  # the line a killed run was writing
-        if row.pop("code", None) != code():
-            continue  # another version's
-        rows[_key(row["method"], row["env_spec"])] = row
+        made_by = row.pop("code", None)
+        rows[_key_of(made_by, row["method"], row.get("training_seed"), row["env_spec"])] = row
     return rows

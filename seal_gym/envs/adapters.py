@@ -23,6 +23,7 @@ from seal_gym.rmp import (
     reference_twist,
     resolve,
 )
+from seal_gym.wrappers.moving_obstacle import Obstacle
 
 CONTROLS = ("tip", "rmp", "joint")
 # An action entry of 1 is a Cholesky entry of 2, a metric of 4: the expert's weights are at most about 1.
@@ -45,6 +46,7 @@ class ArmState:
         part_pose: ``T_base_part``, shape (N, 4, 4), m: for leaves of the simulation's own (an obstacle's
             pose, say); policies are not told.
         seen: Whether both views show the seam, shape (N,).
+        obstacle: Where ``MovingObstacle`` is, if there is one.
     """
 
     q: Array
@@ -55,6 +57,7 @@ class ArmState:
     tip_accel: Array
     part_pose: Array
     seen: NDArray[np.bool_]
+    obstacle: Obstacle | None = None
 
 
 LeafFunction = Callable[[ArmState], Leaf]

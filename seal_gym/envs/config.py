@@ -14,6 +14,8 @@ from seal_gym.tasks.reward import RewardCfg
 from seal_gym.vision.perception import PerceptionCfg
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.workpiece import Workpiece
+from seal_gym.wrappers.base import DisturbanceCfg
+from seal_gym.wrappers.catalogue import disturbances
 
 PERCEPTIONS = ("vision", "oracle")
 OBSERVATIONS = ("features", "features+images")
@@ -57,6 +59,8 @@ class SealCfg:
         renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
         sealant: ``False``: this version simulates the gun's motion, not the sealant.
         leaves: Extra RMP leaves resolved with the policy's, with ``control="rmp"``.
+        disturbances: What acts from outside, in any order (``seal_gym.wrappers``): configurations, names, or
+            dictionaries as from JSON, e.g. ``{"name": "MovingWorkpiece", "severity": 1.0}``.
         task: Outcomes and displacements.
         reward: Weights of the reward.
         vision: Parameters of edge stage, line stage and tracker.
@@ -72,6 +76,7 @@ class SealCfg:
     renderer: str = "raycast"
     sealant: bool = False
     leaves: tuple[LeafFunction, ...] = ()
+    disturbances: tuple[DisturbanceCfg, ...] = ()
     task: SealTaskCfg = field(default_factory=SealTaskCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
     vision: PerceptionCfg = field(default_factory=PerceptionCfg)
@@ -108,6 +113,7 @@ class SealCfg:
             "them out",
         )
         _whole("threads", self.threads, 1, 256)
+        object.__setattr__(self, "disturbances", disturbances(self.disturbances))
         object.__setattr__(self, "leaves", tuple(self.leaves))
 
     @classmethod

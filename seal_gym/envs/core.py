@@ -1,5 +1,6 @@
 """The one implementation of the sealing environment: N simulations at once. Every face drives this."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,7 +8,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from seal_gym.core.errors import ActionError, ConfigError
-from seal_gym.core.frames import Array, axis_angle, tip_rotation, transform, yaw_pose
+from seal_gym.core.frames import Array, axis_angle, cross, tip_rotation, transform, yaw_pose
 from seal_gym.core.kinematics import TipKinematics, tip_kinematics
 from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, check_leaf_function, make_adapter
 from seal_gym.envs.config import SealCfg
@@ -25,6 +26,10 @@ from seal_gym.vision.features import RoiFeatures, SeamLines, ViewGeometry, oracl
 from seal_gym.vision.perception import Perception
 from seal_gym.workpieces import catalogue
 from seal_gym.workpieces.seam import seam_in_world
+from seal_gym.wrappers.base import DisturbanceCfg
+from seal_gym.wrappers.catalogue import disturbances
+from seal_gym.wrappers.moving_obstacle import MovingObstacleCfg, Obstacle
+from seal_gym.wrappers.stack import Disturbances
 
 Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 
@@ -106,15 +111,17 @@ class SealCore:
         """
         cell, task = cfg.cell, cfg.task
         self.cfg, self.n = cfg, n
-        self.scene: Scene = cached_scene(catalogue.get(cfg.workpiece), cell)
-        self._reach = check_reach(
-            self.scene, task.part_shift_m, task.part_yaw_rad, by_vision=cfg.perception == "vision"
-        )
+        workpiece = catalogue.get(cfg.workpiece)
+        self.scene: Scene = cached_scene(workpiece, cell, _obstacle_m(cfg.disturbances))
+        by_vision = cfg.perception == "vision"
+        free = cached_scene(workpiece, cell)
+        self._reach = check_reach(free, task.part_shift_m, task.part_yaw_rad, by_vision=by_vision)
         self._seam = self.scene.workpiece.seam
         self.arm = ArmBatch(self.scene, n, cfg.threads)
         self.adapter = make_adapter(cfg.control, cell, cfg.leaves)
         self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
         self.sensors = Sensors(self.scene, cfg, n)
+        self._disturbances = Disturbances(cfg.disturbances, n, self.adapter.size, self.scene)
         self._views = ViewGeometry.of(cell)
         self._images: Images | None = None
         self._rate = SeamRate(n, cell.timing.frame_s)
@@ -182,6 +189,7 @@ class SealCore:
         for values, new in zip(self.tip, row, strict=True):
             values[i] = new[0]
         self.sensors.reset(i, rng)
+        self._disturbances.reset(i, rng, part_pose, self.sensors.look)
         self.progress.reset(i, hovering[:3, 3])
         self._rate.reset(i)
         if self._vision is not None:
@@ -190,6 +198,8 @@ class SealCore:
         self._tip_accel[i] = 0.0
         self._action[i] = 0.0
         self.frames[i] = 0
+        if self.obstacle is not None:
+            self.arm.place_obstacle(i, self.obstacle.position[i])
 
     def _hover(self, i: int, part_pose: Array, rng: np.random.Generator) -> Array:
         """Puts the gun in a hover where it touches nothing; gives ``T_part_tip``."""
@@ -239,12 +249,12 @@ class SealCore:
             ActionError: If the action has a wrong shape or is not finite.
         """
         action = self._checked(action)
-        qdd = self.adapter(action, self.arm_state())
-        touched = self.arm.step(qdd)
+        qdd = self.adapter(self._disturbances.delayed(action), self.arm_state())
+        touched = self.arm.step(qdd, self._disturbances.outside(self.frames, self.progress.s))
+        self.frames += 1
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
-        self.progress.advance(self._tip_in_part())
-        self.frames += 1
+        self.progress.advance(self._tip_in_part(), self._seam_speed())
         return self._judge(touched, action, before, error)
 
     def observe(self, rows: NDArray[np.bool_] | None = None) -> Observation:
@@ -261,7 +271,7 @@ class SealCore:
         features = self._feature_rows()
         if self.cfg.observation == "features":
             return features
-        images = self._images or self.sensors.images(self.tip.pose, self.arm, self.frames)
+        images = self._images or self._look()
         return {"features": features, "front": images.front, "side": images.side}
 
     # -- the parts of a step ----------------------------------------------------------------------------
@@ -287,6 +297,7 @@ class SealCore:
             tip_accel=self._tip_accel,
             part_pose=self.arm.part_pose,
             seen=np.asarray(self.features.valid.all(axis=1)),
+            obstacle=self.obstacle,
         )
 
     def _track(self, qdd: Array) -> None:
@@ -298,6 +309,16 @@ class SealCore:
         part = self.arm.part_pose
         offset = self.tip.pose[:, :3, 3] - part[:, :3, 3]
         return np.ascontiguousarray((offset[:, None] @ part[:, :3, :3])[:, 0])
+
+    def _seam_speed(self) -> Array | None:
+        """True speed of the seam's point nearest the tip a frame ago, shape (N,), m/s; None at rest."""
+        twist = self.part_twist
+        if twist is None:
+            return None
+        part = self.arm.part_pose
+        point, _ = seam_in_world(self._seam, self.progress.s, part)
+        velocity = twist[:, :3] + cross(twist[:, 3:], point - part[:, :3, 3])
+        return np.asarray(np.sqrt((velocity**2).sum(axis=1)))
 
     def _judge(self, touched: NDArray[np.bool_], action: Array, before: Array, error: Array) -> StepResult:
         cell, progress = self.cfg.cell, self.progress
@@ -321,10 +342,20 @@ class SealCore:
     def _seam_lines(self, rows: NDArray[np.bool_] | None) -> SeamLines:
         """The one place where perception differs: the oracle projects the true seam into the views."""
         if self._vision is not None:
-            self._images = self.sensors.images(self.tip.pose, self.arm, self.frames)
+            self._images = self._look()
             return self._vision.update(self._images.front, self._images.side, self.tip.pose, rows)
         point, tangent = seam_in_world(self._seam, self.progress.s, self.arm.part_pose)
-        return oracle_lines(point, tangent, self.tip.pose, self._views)
+        lines = oracle_lines(point, tangent, self._disturbances.bracket(self.tip.pose), self._views)
+        return self._disturbances.lines(lines, self.frames)
+
+    def _exposed(self) -> Images:
+        """The images as the cameras take them now."""
+        self._disturbances.illuminate(self.sensors.look, self.frames)
+        return self.sensors.images(self._disturbances.bracket(self.tip.pose), self.arm, self.frames)
+
+    def _look(self) -> Images:
+        """The images as they arrive now."""
+        return self._disturbances.images(self._exposed(), self.frames)
 
     def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
         self.lines = self._seam_lines(rows)
@@ -366,6 +397,25 @@ class SealCore:
         return self._rate.twist
 
     @property
+    def part_twist(self) -> Array | None:
+        """True motion of the parts, for metrics and tests: policies are not told.
+
+        Velocity of their origins and angular velocity in the base frame, shape (N, 6), m/s and rad/s; None if
+        they stand still.
+        """
+        return self._disturbances.part_twist(self.frames)
+
+    @property
+    def obstacle(self) -> Obstacle | None:
+        """Where ``MovingObstacle`` is; None if there is none."""
+        return self._disturbances.obstacle(self.frames)
+
+    @property
+    def images(self) -> Images:
+        """The images of this frame as perception got them; without vision, as the cameras take them."""
+        return self._images or self._exposed()
+
+    @property
     def snr_db(self) -> Array | None:
         """Signal-to-noise ratio of the observed images, shape (N, 2), dB; None without images."""
         blind = self.cfg.observation == "features" and self.cfg.perception == "oracle"
@@ -385,6 +435,30 @@ class SealCore:
             raise ActionError(f"control = {self.cfg.control!r} resolves no leaves: use control='rmp'")
         check_leaf_function(leaf)
         self.adapter.leaves.append(leaf)
+
+    def recorded(self) -> list[dict[str, Any]]:
+        """The disturbances as ``disturbances`` takes them again.
+
+        Returns:
+            Ready for JSON.
+        """
+        return [d.to_dict() for d in self.cfg.disturbances]
+
+    def disturbed(self, disturbance: object) -> "SealCore":
+        """The same cells with one disturbance more, before their first reset.
+
+        Args:
+            disturbance: As ``SealCfg.disturbances`` takes them.
+
+        Returns:
+            A new core; leaves added at run time are kept.
+
+        Raises:
+            ConfigError: If it is wrong, or there is one of its kind.
+        """
+        leaves = tuple(self.adapter.leaves) if isinstance(self.adapter, RmpAdapter) else ()
+        more = disturbances((*self.cfg.disturbances, disturbance))
+        return SealCore(replace(self.cfg, leaves=leaves, disturbances=more), self.n)
 
     def seconds(self, i: int) -> float:
         """Simulated time of one episode.
@@ -445,9 +519,19 @@ class SealCore:
         }
         if self.snr_db is not None:
             info["snr_db"] = self.snr_db[i].copy()
+        if self.cfg.disturbances:
+            info["disturbances"] = self.recorded()
+        if self.obstacle is not None:
+            info["obstacle"] = obstacle_info(self.obstacle, i)
         if result is not None and (result.terminated[i] or result.timeout[i]):
             info["episode_metrics"] = self.episode_metrics(i, result)
         return info
+
+
+def _obstacle_m(cfgs: tuple[DisturbanceCfg, ...]) -> float:
+    """Radius of the obstacle that a scene needs."""
+    on = [c.radius_mm for c in cfgs if isinstance(c, MovingObstacleCfg) and c.severity > 0]
+    return 1e-3 * sum(on)
 
 
 def as_action(action: Any, shape: tuple[int, ...], control: str) -> Array:
@@ -473,6 +557,23 @@ def as_action(action: Any, shape: tuple[int, ...], control: str) -> Array:
         given = f"shape {array.shape}" if real else f"no real numbers ({type(action).__name__})"
         raise ActionError(f"action has {given}: control={control!r} takes numbers of shape {shape}")
     return array.astype(np.float64)
+
+
+def obstacle_info(obstacle: Obstacle, i: int) -> dict[str, Any]:
+    """Where the obstacle of one simulation is.
+
+    Args:
+        obstacle: Of N simulations.
+        i: Which one.
+
+    Returns:
+        ``position_m`` and ``velocity_m_s`` in the robot's base frame, and ``radius_m``.
+    """
+    return {
+        "position_m": obstacle.position[i].copy(),
+        "velocity_m_s": obstacle.velocity[i].copy(),
+        "radius_m": obstacle.radius,
+    }
 
 
 def roi_info(f: RoiFeatures, i: int) -> dict[str, float | bool]:

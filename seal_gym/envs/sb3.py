@@ -162,6 +162,21 @@ class SealSb3VecEnv(VecEnv):
         if self.render_mode == "human" and self._view is not None:
             self._view.sync()
 
+    def disturb(self, disturbance: object) -> None:
+        """Adds a disturbance to all rows; a ``reset`` has to follow. What ``seal_gym.wrappers`` call.
+
+        Args:
+            disturbance: As ``SealCfg.disturbances`` takes them.
+
+        Raises:
+            ConfigError: If it is wrong, or there is one of its kind.
+        """
+        self.core = self.core.disturbed(disturbance)
+        self._running = False
+        if self._view is not None:
+            self._view.close()
+            self._view = SceneView(self.core)
+
     # -- what Stable-Baselines3 asks of the rows --------------------------------------------------------
 
     def add_leaf(self, leaf: LeafFunction) -> None:

@@ -97,9 +97,11 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ``tip_error_mm``, ``progress`` (0..1), ``collision``, ``reached``, ``is_success``, ``renderer``,
     ``seam_velocity`` (estimated twist of the seam in the tip frame, m/s and rad/s), ``roi`` (the features by
-    name with validity, in mm, rad and px), ``snr_db`` with images; at an episode's end ``episode_metrics``:
-    ``outcome``, ``reached``, ``collision``, ``timeout`` (lost included), ``rmse_mm`` (None before 10 mm of
-    travel), ``rmse_whole_mm``, ``coverage_pct``, ``time_s``.
+    name with validity, in mm, rad and px), ``snr_db`` with images; ``disturbances`` as the keyword argument
+    takes them again, and ``obstacle`` (``position_m``, ``velocity_m_s``, ``radius_m``), where there are any;
+    at an episode's end ``episode_metrics``: ``outcome``, ``reached``, ``collision``, ``timeout`` (lost
+    included), ``rmse_mm`` (None before 10 mm of travel), ``rmse_whole_mm``, ``coverage_pct``, ``time_s``,
+    and on moving parts ``seam_speed_mm_s``. Errors are those against the seam where it is at that instant.
 
     ## Arguments
 
@@ -184,6 +186,22 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
             bool(result.timeout[0]),
             core.info(0, result),
         )
+
+    def disturb(self, disturbance: object) -> None:
+        """Adds a disturbance; a ``reset`` has to follow. What ``seal_gym.wrappers`` call.
+
+        Args:
+            disturbance: As ``SealCfg.disturbances`` takes them.
+
+        Raises:
+            ConfigError: If it is wrong, or there is one of its kind.
+        """
+        self.core = self.core.disturbed(disturbance)
+        self._ezpickle_kwargs["disturbances"] = self.core.cfg.disturbances
+        self._running = self._ended = False
+        if self._view is not None:
+            self._view.close()
+            self._view = SceneView(self.core)
 
     def add_leaf(self, leaf: LeafFunction) -> None:
         """Adds an RMP leaf at run time; needs ``control="rmp"``.

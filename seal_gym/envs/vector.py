@@ -1,5 +1,6 @@
 """``SealVectorEnv``: the face of the sealing core for ``gymnasium.make_vec``."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -211,6 +212,15 @@ class SealVectorEnv(VectorEnv, EzPickle):
         }
         if core.snr_db is not None:
             values["snr_db"] = core.snr_db.copy()
+        if core.cfg.disturbances:
+            values["disturbances"] = _objects([core.recorded() for _ in range(n)])
+        if core.obstacle is not None:
+            o = core.obstacle
+            values["obstacle"] = {
+                "position_m": o.position,
+                "velocity_m_s": o.velocity,
+                "radius_m": np.full(n, o.radius),
+            }
         info = _masked(values, shown)
         if result is not None:
             for i in np.flatnonzero(self._ended):
@@ -224,6 +234,24 @@ class SealVectorEnv(VectorEnv, EzPickle):
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]  # one a row
         """The rows' generators; None for a row that was never reset."""
         return tuple(self._rngs)
+
+    def disturb(self, disturbance: object) -> None:
+        """Adds a disturbance; a ``reset`` of all rows has to follow. What ``seal_gym.wrappers`` call.
+
+        Args:
+            disturbance: As ``SealCfg.disturbances`` takes them.
+
+        Raises:
+            ConfigError: If it is wrong, or there is one of its kind.
+        """
+        self.core = self.core.disturbed(disturbance)
+        self._ezpickle_kwargs["disturbances"] = self.core.cfg.disturbances
+        if self.spec is not None:
+            self.spec = replace(self.spec, kwargs={**self.spec.kwargs, "disturbances": self.core.recorded()})
+        self._running[:] = self._ended[:] = False
+        if self._view is not None:
+            self._view.close()
+            self._view = SceneView(self.core)
 
     def add_leaf(self, leaf: LeafFunction) -> None:
         """Adds an RMP leaf to all rows at run time; needs ``control="rmp"``.
@@ -263,6 +291,14 @@ class SealVectorEnv(VectorEnv, EzPickle):
     def _show(self) -> None:
         if self.render_mode == "human" and self._view is not None:
             self._view.sync()
+
+
+def _objects(rows: list[Any]) -> NDArray[Any]:
+    """One object a row, whatever numpy might make of it."""
+    out = np.full(len(rows), None, dtype=object)
+    for i, row in enumerate(rows):
+        out[i] = row
+    return out
 
 
 def _roi_arrays(f: RoiFeatures) -> dict[str, NDArray[Any]]:

@@ -151,8 +151,7 @@ class SceneView:
     def _insets(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Both ROIs with what perception made of them; the line stage alone where it is by vision."""
         core = self._core
-        # The same frame has the same noise: these are the images that perception saw.
-        images = core.sensors.images(core.tip.pose, core.arm, core.frames)
+        images = core.images
         self._snr_db = images.snr_db[0]
         shown = (images.front[0], images.side[0])
         stages = None

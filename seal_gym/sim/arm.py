@@ -1,5 +1,7 @@
 """N arms over N parts, stepped together: joint accelerations in, joint states and contacts out."""
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
@@ -9,6 +11,47 @@ from seal_gym.core.errors import PhysicsError
 from seal_gym.core.frames import Array, quat_from_matrix
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_TORQUE, JOINT_UPPER
 from seal_gym.sim.scene import Scene
+
+_CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
+_OUTSIDE = int(
+    mujoco.mjtState.mjSTATE_CTRL
+    | mujoco.mjtState.mjSTATE_XFRC_APPLIED
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+
+
+class Poses(NamedTuple):
+    """Poses of N bodies at K instants.
+
+    Attributes:
+        position: Shape (N, K, 3), m.
+        quat: Shape (N, K, 4), (w, x, y, z).
+    """
+
+    position: Array
+    quat: Array
+
+
+class Outside(NamedTuple):
+    """What moves and pushes in N cells during a frame of S physics steps; None where nothing does.
+
+    A step sees the bodies where they are when it starts, like the arm. MuJoCo knows no velocity of bodies
+    that are moved from outside; the first contact ends an episode, so that none of its forces matters.
+
+    Attributes:
+        part: Poses of the parts at the steps' starts and the frame's end, K = S + 1.
+        part_pose: ``T_base_part`` at the frame's end, shape (N, 4, 4), m.
+        obstacle: Centres of the obstacles at the same instants, shape (N, S + 1, 3), m.
+        force: On a body's centre of mass during each step, in the base frame, shape (N, S, 3), N.
+        pushed: Name of that body.
+    """
+
+    part: Poses | None = None
+    part_pose: Array | None = None
+    obstacle: Array | None = None
+    force: Array | None = None
+    pushed: str = ""
 
 
 class ArmBatch:
@@ -43,6 +86,7 @@ class ArmBatch:
         self.qd: Array = self._batch.bind("qvel")
         self._mocap_pos: Array = self._batch.bind("mocap_pos")
         self._mocap_quat: Array = self._batch.bind("mocap_quat")
+        self._force: Array = self._batch.bind("xfrc_applied")
         self.q_command = np.zeros((n, 6))
         self.qd_command = np.zeros((n, 6))
         self.part_pose = np.tile(np.eye(4), (n, 1, 1))
@@ -82,11 +126,12 @@ class ArmBatch:
         self._mocap_pos[i, 0] = part_pose[:3, 3]
         self._mocap_quat[i, 0] = quat_from_matrix(part_pose[:3, :3])
 
-    def step(self, qdd: Array) -> NDArray[np.bool_]:
+    def step(self, qdd: Array, outside: Outside | None = None) -> NDArray[np.bool_]:
         """Advances all simulations by one frame.
 
         Args:
             qdd: Commanded joint accelerations, shape (N, 6), rad/s^2.
+            outside: What moves and pushes meanwhile; by default nothing.
 
         Returns:
             Whether anything touched anything during the frame, shape (N,).
@@ -107,14 +152,50 @@ class ArmBatch:
         start, rate = q[:, None], qd[:, None]
         t, a = self._t_start, acceleration[:, None]
         target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + self._t_end * a)
+        inputs, spec = (target, _CTRL) if outside is None else (self._inputs(target, outside), _OUTSIDE)
         try:
-            touched = self._batch.rollout(target.shape[1], target, record=("ncon",), out=self._contact)[
+            touched = self._batch.rollout(target.shape[1], inputs, spec, record=("ncon",), out=self._contact)[
                 "ncon"
             ]
         except SimulationError as error:
             raise PhysicsError(f"MuJoCo stopped simulations {error.ids.tolist()}: {error}") from error
+        if outside is not None:
+            self._arrive(outside)
         self.q_command, self.qd_command = reached, speed
         return np.asarray(touched.any(axis=1))
+
+    def _inputs(self, target: Array, outside: Outside) -> Array:
+        """Servo targets, forces and poses of each physics step, in the order of ``mjtState``'s bits."""
+        n, steps, _ = target.shape
+        model = self.scene.model
+        force = np.zeros((n, steps, model.nbody, 6))
+        position = np.repeat(self._mocap_pos[:, None], steps, axis=1)
+        quat = np.repeat(self._mocap_quat[:, None], steps, axis=1)
+        if outside.force is not None:
+            force[:, :, model.body(outside.pushed).id, :3] = outside.force
+        if outside.part is not None:
+            position[:, :, 0], quat[:, :, 0] = outside.part.position[:, :-1], outside.part.quat[:, :-1]
+        if outside.obstacle is not None:
+            position[:, :, 1] = outside.obstacle[:, :-1]
+        return np.concatenate((target, *(x.reshape(n, steps, -1) for x in (force, position, quat))), axis=2)
+
+    def _arrive(self, outside: Outside) -> None:
+        """Puts part and obstacle where they are at the frame's end, as the arm already is; nothing pushes."""
+        self._force[:] = 0.0
+        if outside.part is not None and outside.part_pose is not None:
+            self._mocap_pos[:, 0], self._mocap_quat[:, 0] = (x[:, -1] for x in outside.part)
+            self.part_pose[:] = outside.part_pose
+        if outside.obstacle is not None:
+            self._mocap_pos[:, 1] = outside.obstacle[:, -1]
+
+    def place_obstacle(self, i: int, position: Array) -> None:
+        """Puts the obstacle of one simulation somewhere; the scene must have one.
+
+        Args:
+            i: Which simulation.
+            position: Of its centre in the base frame, shape (3,), m.
+        """
+        self._mocap_pos[i, 1] = position
 
     def data(self, i: int) -> mujoco.MjData:
         """One simulation's state as an ``MjData``, to render it or to look into it.

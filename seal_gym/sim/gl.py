@@ -97,6 +97,8 @@ class GlSensors:
     def _draw(self, tip: Array, part: Array, look: Look, i: int) -> list[Array]:
         data = self._data
         data.mocap_pos[0], data.mocap_quat[0] = part[:3, 3], quat_from_matrix(part[:3, :3])
+        if len(data.mocap_pos) > 1:
+            data.mocap_pos[1] = look.ball[i, :3]
         mujoco.mj_kinematics(self._scene.model, data)
         self._carry_gun(tip @ np.linalg.inv(T_TOOL0_TIP))
         pictures = []

@@ -101,6 +101,10 @@ class Look(NamedTuple):
         blur_px: At most ``MAX_BLUR_PX``, shape (N,), px.
         clip_fraction: Shape (N,).
         seed: Seed of the noise, shape (N,).
+        shadow: A band of shadow on the part: unit normal of its middle plane in the tip frame, the plane's
+            distance from the tip [m], half the band's width [m], share of the light it takes; 0: no shadow,
+            shape (N, 6).
+        ball: An obstacle in the view: centre in the world frame and radius [m]; 0: none, shape (N, 4).
     """
 
     lamp: Array
@@ -114,6 +118,8 @@ class Look(NamedTuple):
     blur_px: Array
     clip_fraction: Array
     seed: NDArray[np.uint64]
+    shadow: Array
+    ball: Array
 
     @classmethod
     def empty(cls, n: int) -> Self:
@@ -139,6 +145,8 @@ class Look(NamedTuple):
             blur_px=np.zeros(n),
             clip_fraction=np.zeros(n),
             seed=np.zeros(n, np.uint64),
+            shadow=np.zeros((n, 6)),
+            ball=np.zeros((n, 4)),
         )
 
     def draw(self, i: int, rng: np.random.Generator, cfg: LookCfg) -> None:

@@ -18,6 +18,7 @@ from seal_gym.core.jit import kernel
 from seal_gym.core.parallel import split
 from seal_gym.sim import texture
 from seal_gym.sim.look import MAX_BLUR_PX, Look
+from seal_gym.sim.raycast_extras import cast_shadow, draw_ball
 from seal_gym.workpieces.surface import MATERIALS, Surface
 
 Ints = NDArray[np.int32]
@@ -722,7 +723,11 @@ def _render_batch(
             edges,
         )
         _paint(mesh.grain, view, shown.face, look, row, b)
+        if look.shadow[row, 5] > 0.0:
+            cast_shadow(b.near, view.rotation, view.position, ray_x, ray_y, look.shadow[row], b.picture)
         _paint_nozzle(view.alpha, view.tool_normal, view.tool_albedo, look, row, b.picture)
+        if look.ball[row, 3] > 0.0:
+            draw_ball(tip[row], view, look, row, b.near, b.picture)
         variance[row] = _sense(b.picture, b.work, b.bins, look, row, view.number, frame[row], out[row])
 
 

@@ -27,6 +27,8 @@ _ENVIRONMENT = {"contype": 2, "conaffinity": 1}
 _VISUAL = {"contype": 0, "conaffinity": 0}
 GUN_PREFIX = "gun/"
 PART_PREFIX = "col_part_"
+OBSTACLE = "obstacle"
+SKIN_RGB = (0.86, 0.66, 0.55)
 TABLE_TOP_M = -0.05 - PLATE_THICKNESS_M
 _FLOOR_M = -0.80
 
@@ -215,6 +217,19 @@ def _add_part(spec: mujoco.MjSpec, workpiece: Workpiece) -> None:
         _add_solid(part, spec, k, solid)
 
 
+def _add_obstacle(spec: mujoco.MjSpec, radius_m: float) -> None:
+    """A ball that is moved from outside; below the floor until then."""
+    body = spec.worldbody.add_body(name=OBSTACLE, mocap=True, pos=[0.0, 0.0, 2 * _FLOOR_M])
+    body.add_geom(
+        name=OBSTACLE,
+        type=_G.mjGEOM_SPHERE,
+        size=[radius_m, 0, 0],
+        rgba=[*SKIN_RGB, 1.0],
+        group=GROUP_PART,
+        **_ENVIRONMENT,
+    )
+
+
 def _add_marker(spec: mujoco.MjSpec, workpiece: Workpiece, cell: CellCfg) -> "PartMarker":
     """The part's AR code and the camera above the cell that reads it."""
     from seal_gym.sim import markers  # loads OpenCV and SciPy: only for marked parts
@@ -251,7 +266,9 @@ def _tool_triangles(model: mujoco.MjModel) -> Array:
     return np.asarray(tip[model.mesh_face[face : face + int(model.mesh_facenum[mesh])]])
 
 
-def build_scene(workpiece: Workpiece, cell: CellCfg, *, marked: bool = False) -> Scene:
+def build_scene(
+    workpiece: Workpiece, cell: CellCfg, *, marked: bool = False, obstacle_m: float = 0.0
+) -> Scene:
     """Composes and compiles the cell.
 
     World frame: the robot's DH base frame, z up. The part is a mocap body, so that it can be displaced
@@ -261,6 +278,7 @@ def build_scene(workpiece: Workpiece, cell: CellCfg, *, marked: bool = False) ->
         workpiece: The part.
         cell: Cameras, timing and limits.
         marked: With the AR code on the part and the overhead camera; they are seen, never felt.
+        obstacle_m: Radius of a ball in the way, the second mocap body [m]; 0: none.
 
     Returns:
         The scene.
@@ -276,6 +294,8 @@ def build_scene(workpiece: Workpiece, cell: CellCfg, *, marked: bool = False) ->
     _add_furniture(spec)
     _add_sensor_cameras(spec.body(GUN_PREFIX + "sealgun"), cell)
     _add_part(spec, workpiece)
+    if obstacle_m > 0.0:
+        _add_obstacle(spec, obstacle_m)
     marker = _add_marker(spec, workpiece, cell) if marked else None
     try:
         model = spec.compile()
@@ -285,14 +305,15 @@ def build_scene(workpiece: Workpiece, cell: CellCfg, *, marked: bool = False) ->
 
 
 @lru_cache(maxsize=16)
-def cached_scene(workpiece: Workpiece, cell: CellCfg) -> Scene:
-    """``build_scene``, compiled once for each workpiece and cell.
+def cached_scene(workpiece: Workpiece, cell: CellCfg, obstacle_m: float = 0.0) -> Scene:
+    """``build_scene``, compiled once for each workpiece, cell and obstacle.
 
     Args:
         workpiece: The part.
         cell: Cameras, timing and limits.
+        obstacle_m: As ``build_scene`` takes it.
 
     Returns:
         The scene; shared, so do not edit its model.
     """
-    return build_scene(workpiece, cell)
+    return build_scene(workpiece, cell, obstacle_m=obstacle_m)

@@ -129,8 +129,10 @@ class Progress:
         self.off_path_m = np.zeros(n)
         self._visited = np.zeros((n, bins), np.bool_)
         self._covered = np.zeros((n, bins), np.bool_)
-        # Sums of squared error: from settle_m on, and over the whole episode; and their counts.
-        self._sums = np.zeros((n, 4))
+        # Sums of squared error: from settle_m on, and over the whole episode; and their counts. Of the seam's
+        # own speed squared, where it moves.
+        self._sums = np.zeros((n, 5))
+        self._moves = False
         self._settled = np.zeros(n, np.bool_)
 
     def reset(self, i: int, tip: Array) -> None:
@@ -158,11 +160,12 @@ class Progress:
         distance, s = nearest_on_path(self._path, self._seam.arc, tip, -window, window)
         return distance, s
 
-    def advance(self, tip: Array) -> None:
+    def advance(self, tip: Array, seam_speed: Array | None = None) -> None:
         """Takes the tips' new positions.
 
         Args:
-            tip: In the part's frame, shape (N, 3), m.
+            tip: In the part's frame as it lies now, shape (N, 3), m.
+            seam_speed: True speed of the seam's point nearest the tip, shape (N,), m/s; None at rest.
         """
         cfg = self._cfg
         _advance(
@@ -188,6 +191,9 @@ class Progress:
         self._sums[:, 1] += self._settled
         self._sums[:, 2] += squared
         self._sums[:, 3] += 1.0
+        if seam_speed is not None:
+            self._moves = True
+            self._sums[:, 4] += seam_speed**2
 
     @property
     def share(self) -> Array:
@@ -214,11 +220,14 @@ class Progress:
             i: Which simulation.
 
         Returns:
-            ``rmse_mm`` (NaN before ``settle_m``), ``rmse_whole_mm`` and ``coverage_pct``.
+            ``rmse_mm`` (NaN before ``settle_m``), ``rmse_whole_mm`` and ``coverage_pct``; on moving parts
+            ``seam_speed_mm_s``, the root mean square of the seam's own speed under the tip.
         """
-        settled, count, whole, steps = self._sums[i]
+        settled, count, whole, steps, speed = self._sums[i]
+        moving = {"seam_speed_mm_s": float(1e3 * np.sqrt(speed / max(steps, 1.0)))} if self._moves else {}
         return {
             "rmse_mm": float(1e3 * np.sqrt(settled / count)) if count else float("nan"),
             "rmse_whole_mm": float(1e3 * np.sqrt(whole / steps)) if steps else float("nan"),
             "coverage_pct": float(100.0 * self._covered[i].mean()),
+            **moving,
         }

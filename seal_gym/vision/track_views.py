@@ -18,6 +18,10 @@ _SETTLED = 6  # frames without a jump after which new grey levels are the usual 
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
+_BENT, _BENT_SHARE = (
+    40.0,
+    1.0 / 3.0,
+)  # quadratic coefficient of a bend [1/m], and the share of the pitch's drift in it
 
 
 @kernel
@@ -253,7 +257,9 @@ def track_side(
     height = _kalman(variance, 0, par.height_q_m, out[0] / per_m[1], r_height, par.gate)
     if height == 0.0:
         return False
-    pitch = _kalman(variance, 1, par.pitch_q_rad, out[1] / per_m[1] * per_m[0], r_pitch, par.gate)
+    # Where the seam bends the side view mixes bend and pitch, and plates bend seldom where seams do.
+    drift = par.pitch_q_rad if abs(bend) < _BENT else _BENT_SHARE * par.pitch_q_rad
+    pitch = _kalman(variance, 1, drift, out[1] / per_m[1] * per_m[0], r_pitch, par.gate)
     height -= pitch * out[4] / per_m[0]
     for k in range(3):
         p[k] += height * lift[k]

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-import agents
 from agents import policies, rollouts, train_bc
 from agents.expert import RmpExpert
-from agents.policies import KINDS, LearnedPolicy, PolicyFileError
+from agents.policies import KINDS, PolicyFileError
 from agents.rollouts import Episode, Labeller
-from agents.train_bc import DaggerCfg, TrainCfg, Trainer, best_of, loss, split, train
+from agents.train_bc import DaggerCfg, TrainCfg, Trainer, loss, split, train
 from seal_gym.core.errors import ConfigError
 from seal_gym.envs.sb3 import SealSb3VecEnv
 
@@ -314,38 +313,3 @@ def test_the_command_writes_a_policy_that_loads(episodes, tmp_path, monkeypatch,
     assert set(card["validation"]) == {"flat", "cylinder"}  # the rectangular part has no say
     assert card["validation"]["flat"]["trials"] == 1
     json.dumps(card)
-
-
-def card(flat, cylinder):
-    scores = [{"trials": 10, "reached": reached, "rmse_mm": rmse} for reached, rmse in (flat, cylinder)]
-    return {"validation": dict(zip(("flat", "cylinder"), scores, strict=True))}
-
-
-def test_the_seed_to_ship():
-    cards = [card((10, 0.3), (9, 0.1)), card((10, 0.3), (10, 0.3)), card((10, 0.2), (10, 0.3))]
-    assert best_of(cards) == 2
-    assert best_of(cards[:2]) == 1
-    assert best_of([card((0, None), (0, None)), card((0, None), (1, 2.0))]) == 1
-    with pytest.raises(ConfigError, match="--validate"):
-        best_of([{}])
-
-
-def test_shipping_takes_the_best_seed_and_keeps_the_others(tmp_path, monkeypatch):
-    def trained(seed, reached, **more):
-        path = tmp_path / f"run{seed}" / "x.safetensors"
-        made = {**card((10, 0.1), (reached, 0.1)), "seed": seed, "data_sha256": "d", **more}
-        policies.save(LearnedPolicy.fresh("neural_rmp", seed), path, made)
-        return path
-
-    paths, folder = [trained(seed, reached) for seed, reached in ((0, 9), (1, 10), (2, 8))], tmp_path / "w"
-    train_bc.ship(paths, folder)
-    assert {p.stem for p in folder.glob("*.safetensors")} == {
-        "neural_rmp",
-        *(f"neural_rmp-seed{k}" for k in range(3)),
-    }
-    monkeypatch.setattr(agents, "WEIGHTS", folder)
-    shipped = agents.load_policy("neural_rmp")
-    assert_same(shipped, LearnedPolicy.fresh("neural_rmp", 1))
-    assert shipped.card["seed"] == 1
-    with pytest.raises(ConfigError, match=r"seeds 0 and 3 differ in \['data_sha256'\]"):
-        train_bc.ship([paths[0], trained(3, 10, data_sha256="e")], folder)
