@@ -1,14 +1,23 @@
-"""The classical adaptive baseline: map the seam ahead with a laser profile sensor, replan, play back.
+"""The classical adaptive baseline: map the seam ahead with laser profiles, replan, play back.
 
 Manorathna et al. 2014 ("Feature extraction and tracking of a weld joint for adaptive robotic welding"), with
 which Zhou et al. compare themselves (their reference 19, Table 4). Each frame a depth profile across the
 seam gives one point of it, a look-ahead before the tip. Points are gated, moved to the base frame and kept.
 Every few points a polynomial through the last ones becomes the path, which a position servo follows at
-fixed speed. The method takes the part to stand still: when the tip comes to a point, the point is
-look-ahead / speed old.
+fixed speed. Two variants:
+
+- ``plain()``: the method as it was published. One line, and the part is taken to stand still: when the tip
+  comes to a point, the point is look-ahead / speed = 0.3 s old, and 10 mm/s of the part are 3 mm of error.
+- ``AdaptiveCfg()``: two lines, and the part's motion is estimated. With one line a moving straight seam and
+  a resting slanted one give the same points. Of two lines the second one comes to a place where the first
+  has been, and what has changed there is motion. So the fit has columns of time beside those of arc length
+  (velocity and acceleration of the part), points are moved along to the present, and the servo is fed
+  forward. Seam trackers with several lines are sold, and the depth sensor that Zhou et al. put in the
+  laser's place sees an area. Motion along a straight seam cannot be seen, and is not needed there.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -32,9 +41,14 @@ class AdaptiveCfg:
     """Sensor, path and servo; ``python -m agents.tune_adaptive`` compares their settings.
 
     Attributes:
-        depth: The sensor.
+        depth: The sensor; its look-ahead is that of the line nearer to the tip.
+        second_line_m: A second line lies this far ahead of the first one [m]; 0: there is none.
+        motion: Order in time of the part's estimated motion: 0 stands still, 1 velocity, 2 acceleration too.
+        point_m: Assumed standard deviation of a point of the seam [m].
+        velocity_m_s: How far the velocity may be from what the last fit foretold [m/s].
+        accel_m_s2: How large its acceleration may be [m/s^2].
         seam: How the seam is found in a profile.
-        window: Points that a path is fitted through (W).
+        window: Points of each line that a path is fitted through (W).
         replan: Points from one fit to the next (K).
         order: Largest order of the polynomial.
         spacing_m: A point this far beyond the last one is kept [m].
@@ -53,6 +67,11 @@ class AdaptiveCfg:
 
     depth: DepthCfg = field(default_factory=DepthCfg)
     seam: SeamPointCfg = field(default_factory=SeamPointCfg)
+    second_line_m: float = 1.5e-3
+    motion: int = 2
+    point_m: float = 5e-5
+    velocity_m_s: float = 5e-3
+    accel_m_s2: float = 1e-2
     window: int = 24
     replan: int = 1
     order: int = 2
@@ -76,6 +95,7 @@ class AdaptiveCfg:
             ("replan", 1, 1000),
             ("order", 1, 3),
             ("patience", 1, 1000),
+            ("motion", 0, 2),
         ):
             value = getattr(self, name)
             require(
@@ -84,10 +104,28 @@ class AdaptiveCfg:
             )
         for name in ("spacing_m", "span_m", "gate_mad", "gate_floor_m", "braking_m_s2", "omega_n", "zeta"):
             self._positive(name)
-        for name in ("approach_m_s", "turning_rad_s", "land_m"):
+        for name in ("approach_m_s", "turning_rad_s", "land_m", "point_m", "velocity_m_s", "accel_m_s2"):
             self._positive(name)
-        value = self.extrapolate_m
-        require(is_number(value) and value >= 0, f"AdaptiveCfg.extrapolate_m = {value!r}: must be >= 0")
+        for name in ("extrapolate_m", "second_line_m"):
+            value = getattr(self, name)
+            require(is_number(value) and value >= 0, f"AdaptiveCfg.{name} = {value!r}: must be >= 0")
+        require(
+            self.motion == 0 or self.second_line_m > 0,
+            f"AdaptiveCfg.motion = {self.motion}, second_line_m = 0: one line cannot tell the part's motion "
+            "from the seam's slant; give second_line_m > 0, or motion=0",
+        )
+
+    @classmethod
+    def plain(cls, **kwargs: Any) -> Self:
+        """The method as it was published: one line, and the part is taken to stand still.
+
+        Args:
+            **kwargs: Other settings.
+
+        Returns:
+            The configuration.
+        """
+        return cls(second_line_m=0.0, motion=0, **kwargs)
 
     def _positive(self, name: str) -> None:
         value = getattr(self, name)
@@ -95,19 +133,63 @@ class AdaptiveCfg:
 
 
 class Path(NamedTuple):
-    """A polynomial in arc length through points of the seam.
+    """A polynomial in arc length through points of the seam, and its motion.
 
     Attributes:
         coefficients: Of 1, (u - origin), (u - origin)^2, ..., shape (order + 1, 3), m.
         origin: Arc length about which the polynomial is written [m].
         end: Arc length of the last point [m].
         spread: Median distance of the points from it [m].
+        drift: Its velocity and acceleration, as far as they are estimated, shape (motion, 3), m/s and m/s^2.
+        time_s: For which it holds [s].
     """
 
     coefficients: Array
     origin: float
     end: float
     spread: float
+    drift: Array = np.empty((0, 3))
+    time_s: float = 0.0
+
+    def moved(self, time_s: float) -> "Path":
+        """The path at another time [s]."""
+        dt = time_s - self.time_s
+        if not len(self.drift):
+            return self._replace(time_s=time_s)
+        coefficients, drift = self.coefficients.copy(), self.drift.copy()
+        coefficients[0] += _clock(dt, len(drift)) @ drift
+        drift[0] += _clock(dt, len(drift) - 1) @ drift[1:]
+        return self._replace(coefficients=coefficients, drift=drift, time_s=time_s)
+
+    def across(self, u: float) -> Array:
+        """Velocity across its own direction at an arc length, shape (3,), m/s."""
+        if not len(self.drift):
+            return np.zeros(3)
+        tangent = self.slope(u)
+        velocity = self.drift[0]
+        return np.asarray(velocity - (velocity @ tangent) / (tangent @ tangent) * tangent)
+
+    def foot(self, point: Array) -> tuple[float, float]:
+        """Where a point lies: beyond the end on the straight continuation, before it on the curve.
+
+        Args:
+            point: Shape (3,), m.
+
+        Returns:
+            Arc length and distance [m].
+        """
+        tangent = self.slope(self.end)
+        along = float((point - self.at(self.end)) @ tangent / (tangent @ tangent))
+        u = self.end + along
+        if along >= 0.0:
+            return (
+                self.end + along * float(np.linalg.norm(tangent)),
+                float(np.linalg.norm(point - self.at(self.end) - along * tangent)),
+            )
+        for _ in range(_NEWTON_STEPS):
+            slope = self.slope(u)
+            u += float((point - self.at(u)) @ slope / (slope @ slope))
+        return u, float(np.linalg.norm(point - self.at(u)))
 
     def at(self, u: Array | float) -> Array:
         """Positions at arc lengths of shape (...): shape (..., 3), m."""
@@ -133,8 +215,9 @@ class Track(NamedTuple):
     """What the controller remembers of one simulation.
 
     Attributes:
-        points: Kept points of the seam in the base frame, oldest first, shape (k, 3), m.
+        points: Kept points of the seam in the base frame where they were seen, oldest first, shape (k, 3), m.
         arc: Their arc length from the first point of the episode, shape (k,), m.
+        times: When they were seen, shape (k,), s.
         path: The planned path; None before the first point.
         unplanned: Points kept since it was fitted.
         outliers: Points refused in a row.
@@ -144,6 +227,7 @@ class Track(NamedTuple):
 
     points: Array = np.empty((0, 3))
     arc: Array = np.empty(0)
+    times: Array = np.empty(0)
     path: Path | None = None
     unplanned: int = 0
     outliers: int = 0
@@ -154,75 +238,113 @@ class Track(NamedTuple):
 # -- the map ---------------------------------------------------------------------------------------------
 
 
-def extend(track: Track, point: Array, pose: Array, cfg: AdaptiveCfg) -> Track:
-    """Takes one measured point of the seam into the map, or refuses it.
+def extend(track: Track, points: Sequence[Array], time_s: float, pose: Array, cfg: AdaptiveCfg) -> Track:
+    """Takes a frame's measured points of the seam into the map, or refuses them.
 
     Args:
         track: The map.
-        point: In the base frame, shape (3,), m.
+        points: One of each line that found the seam, the nearer one's first, in the base frame, shape (3,)
+            each, m.
+        time_s: When they were seen [s].
         pose: ``T_base_tip``, shape (4, 4), m.
         cfg: Gate, spacing and fit.
 
     Returns:
-        The new map.
+        The new map, its path moved to this time.
     """
     forward = pose[:3, _Y]
-    if track.path is None or not track.landed:
-        # The gun stands: nothing to join the point to, and a later one is as good and newer.
-        return _begin(point, forward, cfg)
-    if _off(track.path, point) > max(cfg.gate_mad * track.path.spread, cfg.gate_floor_m):
-        if track.outliers < cfg.patience:
-            return track._replace(outliers=track.outliers + 1)
-        return _begin(point, forward, cfg)._replace(landed=True)
-    step = point - track.points[-1]
-    if step @ forward < cfg.spacing_m:
-        return track._replace(outliers=0)
-    kept = slice(-cfg.window, None)
-    points = np.concatenate((track.points, point[None]))[kept]
-    arc = np.append(track.arc, track.arc[-1] + np.linalg.norm(step))[kept]
-    track = track._replace(points=points, arc=arc, unplanned=track.unplanned + 1, outliers=0)
-    if track.unplanned < cfg.replan:
+    if track.path is not None:
+        track = track._replace(path=track.path.moved(time_s))
+    for k, point in enumerate(points):
+        if track.path is None or not (track.landed or cfg.motion):
+            # The gun stands, and a later point is as good as an earlier one, and newer.
+            track = _begin(point, time_s, forward, cfg)
+        else:
+            track = _join(track, track.path, point, time_s, forward, cfg, again=k > 0)
+    if track.path is None or track.unplanned < cfg.replan:
         return track
-    return track._replace(path=fit(points, arc, forward, cfg), unplanned=0)
+    path = fit(track.points, track.arc, track.times, forward, cfg, track.path)
+    return track._replace(path=path, unplanned=0)
 
 
-def _begin(point: Array, forward: Array, cfg: AdaptiveCfg) -> Track:
-    """A map of one point: the path goes straight ahead through it."""
-    path = Path(np.stack((point, forward)), 0.0, 0.0, 0.0)
-    return Track(points=point[None], arc=np.zeros(1), path=path, at=-cfg.depth.look_ahead_m)
+def _join(
+    track: Track, path: Path, point: Array, time_s: float, forward: Array, cfg: AdaptiveCfg, *, again: bool
+) -> Track:
+    """One point into a map that has a path."""
+    u, off = path.foot(point)
+    if off > max(cfg.gate_mad * path.spread, cfg.gate_floor_m):
+        if again or track.outliers < cfg.patience:
+            return track._replace(outliers=track.outliers + (not again))
+        begun = _begin(point, time_s, forward, cfg)
+        return begun._replace(landed=track.landed)
+    if not cfg.motion and u - track.arc[-1] < cfg.spacing_m:
+        return track._replace(outliers=0)
+    kept = slice(-cfg.window * (1 + (cfg.second_line_m > 0)), None)
+    return track._replace(
+        points=np.concatenate((track.points, point[None]))[kept],
+        arc=np.append(track.arc, u)[kept],
+        times=np.append(track.times, time_s)[kept],
+        unplanned=track.unplanned + (not again),
+        outliers=track.outliers if again else 0,
+    )
 
 
-def _off(path: Path, point: Array) -> float:
-    """Distance from a point to the path's continuation beyond its end [m]."""
-    tangent = path.slope(path.end)
-    off = point - path.at(path.end)
-    along = float(off @ tangent / (tangent @ tangent))
-    return float(np.linalg.norm(point - path.at(path.end + along)))
+def _begin(point: Array, time_s: float, forward: Array, cfg: AdaptiveCfg) -> Track:
+    """A map of one point: the path goes straight ahead through it, and stands still."""
+    path = Path(np.stack((point, forward)), 0.0, 0.0, 0.0, np.zeros((cfg.motion, 3)), time_s)
+    return Track(
+        points=point[None],
+        arc=np.zeros(1),
+        times=np.array([time_s]),
+        path=path,
+        at=-cfg.depth.look_ahead_m,
+    )
 
 
-def fit(points: Array, arc: Array, forward: Array, cfg: AdaptiveCfg) -> Path:
-    """Least-squares polynomial in arc length through points of the seam.
+def fit(points: Array, arc: Array, times: Array, forward: Array, cfg: AdaptiveCfg, last: Path) -> Path:
+    """Least-squares polynomial through points of the seam: in arc length, and in time where it moves.
+
+    The motion is drawn weakly towards what the last path foretold: without the second line's points nothing
+    else holds it.
 
     Args:
         points: Oldest first, shape (k, 3), m.
         arc: Their arc lengths, shape (k,), m.
+        times: When they were seen, shape (k,), s.
         forward: Direction of travel, for points too close together to have one, shape (3,).
-        cfg: Largest order, and the span that each order needs.
+        cfg: Largest order, the span that each order needs, and the motion.
+        last: The last path, moved to the present.
 
     Returns:
-        The path.
+        The path at the time of ``last``.
     """
-    origin, span = float(arc[0] + arc[-1]) / 2, float(arc[-1] - arc[0])
+    start, end = float(arc.min()), float(arc.max())
+    origin, span = 0.5 * (start + end), end - start
     order = min(cfg.order, int(span / cfg.span_m), len(arc) - 2)
-    if order < 1:
-        coefficients = np.stack((points.mean(axis=0), forward))
-        origin = float(arc.mean())
-    else:
-        scaled = np.vander((arc - origin) / span, order + 1, increasing=True)
-        coefficients = np.linalg.lstsq(scaled, points, rcond=None)[0] / span ** np.arange(order + 1)[:, None]
-    path = Path(coefficients, origin, float(arc[-1]), 0.0)
-    off = np.linalg.norm(path.at(arc) - points, axis=1)
+    straight = order < 1
+    if straight:
+        # About the newest points' place: others say nothing of the slope.
+        order, origin = 0, float(arc.mean())
+    columns = np.vander((arc - origin) / max(span, 1e-6), order + 1, increasing=True)
+    seen = points - np.outer(arc - origin, forward) if straight else points
+    clock = _clock(times - last.time_s, cfg.motion)
+    doubt = np.array([cfg.velocity_m_s, cfg.accel_m_s2])[: cfg.motion] / cfg.point_m
+    hold = np.hstack((np.zeros((cfg.motion, order + 1)), np.diag(1.0 / doubt)))
+    foretold = np.concatenate((last.drift[:1], np.zeros((max(cfg.motion - 1, 0), 3))))
+    rows = np.vstack((np.hstack((columns, clock)), hold))
+    found = np.linalg.lstsq(rows, np.vstack((seen, foretold / doubt[:, None])), rcond=None)[0]
+    coefficients = found[: order + 1] / max(span, 1e-6) ** np.arange(order + 1)[:, None]
+    if straight:
+        coefficients = np.stack((coefficients[0], forward))
+    path = Path(coefficients, origin, end, 0.0, found[order + 1 :], last.time_s)
+    off = np.linalg.norm(path.at(arc) + clock @ path.drift - points, axis=1)
     return path._replace(spread=_MAD_TO_SIGMA * float(np.median(off)))
+
+
+def _clock(dt: Array | float, order: int) -> Array:
+    """Columns of time: dt, dt^2 / 2, shape (..., order)."""
+    t = np.asarray(dt, dtype=np.float64)
+    return np.stack([t, 0.5 * t * t][:order], axis=-1) if order else np.empty((*t.shape, 0))
 
 
 # -- the servo -------------------------------------------------------------------------------------------
@@ -285,7 +407,7 @@ def aim(path: Path, at: float, pose: Array, speed_m_s: float, stand_off_m: float
         lean_rad: Rotation about y that restores the taught lean [rad].
 
     Returns:
-        Error and reference in the tip frame.
+        Error and reference in the tip frame; on a path that moves the reference moves with it.
     """
     turn = pose[:3, :3].T
     seam = turn @ (path.at(at) - pose[:3, 3])
@@ -297,7 +419,7 @@ def aim(path: Path, at: float, pose: Array, speed_m_s: float, stand_off_m: float
     rate = speed_m_s / max(1.0 - stand_off_m * bend[2], 0.5)
     turning = rate * np.array([bend[2], 0.0, -bend[0]])
     offset = np.array([seam[0], 0.0, seam[2] + stand_off_m])
-    return Aim(np.concatenate((offset, heading)), np.concatenate((speed_m_s * tangent, turning)))
+    return Aim(np.concatenate((offset, heading)), np.concatenate((speed_m_s * tangent + turn @ path.across(at), turning)))
 
 
 def servo(target: Aim, twist: Array, cfg: AdaptiveCfg) -> Array:
@@ -352,7 +474,9 @@ class Adaptive:
         """
         self.cfg = cfg or AdaptiveCfg()
         self._core = core
-        self._sensor = DepthSensor(core.scene, self.cfg.depth)
+        depth, ahead = self.cfg.depth, self.cfg.second_line_m
+        lines = [depth, replace(depth, look_ahead_m=depth.look_ahead_m + ahead)][: 1 + (ahead > 0)]
+        self._sensors = [DepthSensor(core.scene, line) for line in lines]
         cell = core.cfg.cell
         self._process = cell.process
         self._scale = np.array([cell.limits.linear_m_s2] * 3 + [cell.limits.angular_rad_s2] * 3)
@@ -414,32 +538,36 @@ class Adaptive:
         tracks = [Track() if new else track for track, new in zip(old, fresh, strict=True)]
         pose = tip_kinematics(np.ascontiguousarray(rows[:, 23:29]), np.ascontiguousarray(rows[:, 29:35])).pose
         points = self._points(pose)
-        acted = [self._act(*row) for row in zip(tracks, points, pose, rows, strict=True)]
+        times = self._core.frames * self._core.cfg.cell.timing.frame_s
+        acted = [self._act(*row) for row in zip(tracks, points, times, pose, rows, strict=True)]
         accel = np.stack([a for _, a in acted])
         action = np.clip(accel / self._scale, -1.0, 1.0).astype(np.float32)
         return (action if features.ndim == 2 else action[0]), tuple(track for track, _ in acted)
 
-    def _points(self, pose: Array) -> list[Array | None]:
-        """The seam's points that the sensors see now, in the base frame."""
+    def _points(self, pose: Array) -> list[list[Array]]:
+        """The seam's points that the lines see now, in the base frame, of each simulation."""
         core = self._core
         # As the cameras' noise: the same frame of the same episode has the same.
         rngs = [
             np.random.default_rng([int(seed), int(frame)])
             for seed, frame in zip(core.sensors.look.seed, core.frames, strict=True)
         ]
-        profile = self._sensor.measure(core.tip.pose, core.arm.part_pose, rngs)
-        found = [find_seam(across, depth, self.cfg.seam) for across, depth in zip(*profile, strict=True)]
-        return [
-            None if fix is None else self._sensor.to_base(np.array(fix.across_m), np.array(fix.depth_m), T)
-            for fix, T in zip(found, pose, strict=True)
-        ]
+        points: list[list[Array]] = [[] for _ in rngs]
+        for sensor in self._sensors:
+            profile = sensor.measure(core.tip.pose, core.arm.part_pose, rngs)
+            for row, across, depth, T in zip(points, *profile, pose, strict=True):
+                fix = find_seam(across, depth, self.cfg.seam)
+                if fix is not None:
+                    row.append(sensor.to_base(np.array(fix.across_m), np.array(fix.depth_m), T))
+        return points
 
-    def _act(self, track: Track, point: Array | None, pose: Array, row: Array) -> tuple[Track, Array]:
+    def _act(
+        self, track: Track, points: list[Array], time_s: float, pose: Array, row: Array
+    ) -> tuple[Track, Array]:
         """One simulation's new memory and tip acceleration."""
         cfg, process = self.cfg, self._process
         twist = np.concatenate((_MM * row[11:14], _DEG * row[14:17]))
-        if point is not None:
-            track = extend(track, point, pose, cfg)
+        track = extend(track, points, time_s, pose, cfg)
         if track.path is None:
             return track, servo(Aim(np.zeros(6), np.zeros(6)), twist, cfg)
         path = track.path

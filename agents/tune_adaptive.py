@@ -5,7 +5,8 @@
 Starting from ``AdaptiveCfg()`` each parameter in turn goes through its choices, the others staying at the
 best so far; best is what reached most often over the three parts, then what has the smallest RMSE (in steps
 of 0.005 mm), then the first. Killed and started again with the same command it goes on. The parts stand
-still. Look-aheads below 3 mm are left out: the sealant that wells up before the mouth would cover the line.
+still, or move with --severity (``MovingWorkpiece``). With --plain one line and no estimate of the part's
+motion, as published. Look-aheads below 3 mm are left out: the sealant that wells up before the mouth would cover the line.
 With perception="oracle", as the policy looks at no image.
 """
 
@@ -24,6 +25,7 @@ from agents.rollouts import FIRST_VALIDATION_SEED
 from seal_gym.core.errors import SealGymError, require
 from seal_gym.envs.sb3 import SealSb3VecEnv
 from seal_gym.workpieces.catalogue import NAMES
+from seal_gym.wrappers.moving_workpiece import MovingWorkpieceCfg
 
 CHOICES: dict[str, tuple[float, ...]] = {
     "look_ahead_m": (0.003, 0.0045, 0.008, 0.015),
@@ -53,7 +55,12 @@ def configure(settings: dict[str, float]) -> AdaptiveCfg:
 
 
 def episodes(
-    workpiece: str, trials: int, seed: int, cfg: AdaptiveCfg | None = None, perception: str = "oracle"
+    workpiece: str,
+    trials: int,
+    seed: int,
+    cfg: AdaptiveCfg | None = None,
+    severity: float = 0.0,
+    perception: str = "oracle",
 ) -> list[dict[str, Any]]:
     """Metrics of the baseline's episodes.
 
@@ -62,12 +69,19 @@ def episodes(
         trials: How many, all at once.
         seed: Of the first; the others follow.
         cfg: The baseline's settings.
+        severity: Of ``MovingWorkpiece``; 0: the parts stand still.
         perception: Of the environment; the baseline does not use it.
 
     Returns:
         ``episode_metrics`` of each, in order.
     """
-    venv = SealSb3VecEnv(trials, workpiece=workpiece, control=Adaptive.control, perception=perception)
+    venv = SealSb3VecEnv(
+        trials,
+        workpiece=workpiece,
+        control=Adaptive.control,
+        perception=perception,
+        disturbances=[MovingWorkpieceCfg(severity=severity)],
+    )
     policy = Adaptive.of(venv, cfg)
     venv.seed(seed)
     observation: Any = venv.reset()
