@@ -33,6 +33,7 @@ from seal_gym.sim.depth_seam import SeamPointCfg, find_seam
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _MAD_TO_SIGMA = 1.4826
 _NEWTON_STEPS = 3
+_REACH_M = 0.02  # from a path's end; nothing is looked for farther away
 _Y = 1
 
 
@@ -188,7 +189,8 @@ class Path(NamedTuple):
             )
         for _ in range(_NEWTON_STEPS):
             slope = self.slope(u)
-            u += float((point - self.at(u)) @ slope / (slope @ slope))
+            u += float((point - self.at(u)) @ slope / max(float(slope @ slope), 0.3))
+            u = float(np.clip(u, self.end - _REACH_M, self.end + _REACH_M))
         return u, float(np.linalg.norm(point - self.at(u)))
 
     def at(self, u: Array | float) -> Array:
@@ -332,7 +334,15 @@ def fit(points: Array, arc: Array, times: Array, forward: Array, cfg: AdaptiveCf
     hold = np.hstack((np.zeros((cfg.motion, order + 1)), np.diag(1.0 / doubt)))
     foretold = np.concatenate((last.drift[:1], np.zeros((max(cfg.motion - 1, 0), 3))))
     rows = np.vstack((np.hstack((columns, clock)), hold))
-    found = np.linalg.lstsq(rows, np.vstack((seen, foretold / doubt[:, None])), rcond=None)[0]
+    moving = np.linalg.lstsq(rows, np.vstack((seen, foretold / doubt[:, None])), rcond=None)[0]
+    # A seam that moves along itself looks the same: the points' arc length, found on the last path, says
+    # nothing of it, and would only feed back what was believed.
+    along = last.slope(last.end)
+    along = along / np.linalg.norm(along)
+    across = np.eye(3) - np.outer(along, along)
+    resting = np.linalg.lstsq(columns, seen @ np.outer(along, along), rcond=None)[0]
+    found = moving @ across
+    found[: order + 1] += resting
     coefficients = found[: order + 1] / max(span, 1e-6) ** np.arange(order + 1)[:, None]
     if straight:
         coefficients = np.stack((coefficients[0], forward))
@@ -378,6 +388,7 @@ def abreast(path: Path, pose: Array, start: float) -> float:
         ahead = float((path.at(u) - pose[:3, 3]) @ pose[:3, _Y])
         # A path that turns away must not send the search off.
         u -= ahead / max(float(path.slope(u) @ pose[:3, _Y]), 0.3)
+        u = float(np.clip(u, path.end - _REACH_M, path.end + _REACH_M))
     return u
 
 
