@@ -272,7 +272,7 @@ def extend(track: Track, points: Sequence[Array], time_s: float, pose: Array, cf
 def _join(
     track: Track, path: Path, point: Array, time_s: float, forward: Array, cfg: AdaptiveCfg, *, again: bool
 ) -> Track:
-    """One point into a map that has a path."""
+    """One point into a map that has a path; ``again``: another of this frame has been there before."""
     u, off = path.foot(point)
     if off > max(cfg.gate_mad * path.spread, cfg.gate_floor_m):
         if again or track.outliers < cfg.patience:
@@ -325,7 +325,6 @@ def fit(points: Array, arc: Array, times: Array, forward: Array, cfg: AdaptiveCf
     order = min(cfg.order, int(span / cfg.span_m), len(arc) - 2)
     straight = order < 1
     if straight:
-        # About the newest points' place: others say nothing of the slope.
         order, origin = 0, float(arc.mean())
     columns = np.vander((arc - origin) / max(span, 1e-6), order + 1, increasing=True)
     seen = points - np.outer(arc - origin, forward) if straight else points
@@ -430,7 +429,10 @@ def aim(path: Path, at: float, pose: Array, speed_m_s: float, stand_off_m: float
     rate = speed_m_s / max(1.0 - stand_off_m * bend[2], 0.5)
     turning = rate * np.array([bend[2], 0.0, -bend[0]])
     offset = np.array([seam[0], 0.0, seam[2] + stand_off_m])
-    return Aim(np.concatenate((offset, heading)), np.concatenate((speed_m_s * tangent + turn @ path.across(at), turning)))
+    return Aim(
+        np.concatenate((offset, heading)),
+        np.concatenate((speed_m_s * tangent + turn @ path.across(at), turning)),
+    )
 
 
 def servo(target: Aim, twist: Array, cfg: AdaptiveCfg) -> Array:

@@ -1,20 +1,21 @@
 """Chooses the settings of the adaptive baseline on validation seeds.
 
     python -m agents.tune_adaptive --trials 20 --seed 500000 --out out/adaptive
+    python -m agents.tune_adaptive --severity 1 --out out/adaptive_moving
 
 Starting from ``AdaptiveCfg()`` each parameter in turn goes through its choices, the others staying at the
 best so far; best is what reached most often over the three parts, then what has the smallest RMSE (in steps
 of 0.005 mm), then the first. Killed and started again with the same command it goes on. The parts stand
 still, or move with --severity (``MovingWorkpiece``). With --plain one line and no estimate of the part's
-motion, as published. Look-aheads below 3 mm are left out: the sealant that wells up before the mouth would cover the line.
-With perception="oracle", as the policy looks at no image.
+motion, as published. Look-aheads below 3 mm are left out: the sealant that wells up before the mouth would
+cover the line. With perception="oracle", as the policy looks at no image.
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,24 +33,65 @@ CHOICES: dict[str, tuple[float, ...]] = {
     "window": (12, 24, 40),
     "order": (1, 2, 3),
     "omega_n": (8.0, 12.0),
+    "second_line_m": (1e-3, 1.5e-3, 3e-3),
+    "motion": (1, 2),
+    "accel_m_s2": (3e-3, 1e-2),
 }
+_OF_MOTION = ("second_line_m", "motion", "accel_m_s2")  # ``AdaptiveCfg.plain()`` has none of it
 _SAME_MM = 0.005
 _FIRST_TABLE_SEED = 1_000_000
 
 Row = dict[str, Any]
 
 
-def configure(settings: dict[str, float]) -> AdaptiveCfg:
+@dataclass(frozen=True, kw_only=True)
+class TuneCfg:
+    """What is tuned, and on what.
+
+    Attributes:
+        trials: Of each part and setting.
+        seed: Of the first trial.
+        severity: Of ``MovingWorkpiece``; 0: the parts stand still.
+        plain: The variant as published, or the one that estimates the part's motion.
+    """
+
+    trials: int = 20
+    seed: int = FIRST_VALIDATION_SEED
+    severity: float = 0.0
+    plain: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        require(self.trials >= 1, f"--trials {self.trials}: must be at least 1")
+        require(
+            FIRST_VALIDATION_SEED <= self.seed <= _FIRST_TABLE_SEED - self.trials,
+            f"--seed {self.seed}: tuning is for {FIRST_VALIDATION_SEED}..{_FIRST_TABLE_SEED - 1}",
+        )
+        MovingWorkpieceCfg(severity=self.severity)  # it knows its range
+
+    @property
+    def base(self) -> AdaptiveCfg:
+        """The settings to start from."""
+        return AdaptiveCfg.plain() if self.plain else AdaptiveCfg()
+
+    @property
+    def choices(self) -> dict[str, tuple[float, ...]]:
+        """The parameters to choose, and among what."""
+        return {n: v for n, v in CHOICES.items() if not (self.plain and n in _OF_MOTION)}
+
+
+def configure(settings: dict[str, float], base: AdaptiveCfg | None = None) -> AdaptiveCfg:
     """The configuration of some settings.
 
     Args:
         settings: Values by the names in ``CHOICES``.
+        base: What the other settings are taken from; ``AdaptiveCfg()`` by default.
 
     Returns:
-        ``AdaptiveCfg`` with these.
+        ``base`` with these.
     """
     others = {name: value for name, value in settings.items() if name != "look_ahead_m"}
-    cfg = replace(AdaptiveCfg(), **others)  # type: ignore[arg-type]  # whole numbers are ints in CHOICES
+    cfg = replace(base or AdaptiveCfg(), **others)  # type: ignore[arg-type]  # whole numbers are ints in CHOICES
     look_ahead = settings.get("look_ahead_m", cfg.depth.look_ahead_m)
     return replace(cfg, depth=replace(cfg.depth, look_ahead_m=look_ahead))
 
@@ -116,15 +158,16 @@ def summary(metrics: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _evaluate(settings: dict[str, float], trials: int, seed: int, log: Path) -> Row:
+def _evaluate(settings: dict[str, float], cfg: TuneCfg, log: Path) -> Row:
     """All parts with some settings, from the log where they are in it."""
-    asked = {"settings": settings, "trials": trials, "seed": seed}
+    asked = {"settings": settings, **asdict(cfg)}
     for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else ():
         row: Row = json.loads(line)
-        if {k: row[k] for k in asked} == asked:
+        if {k: row.get(k) for k in asked} == asked:
             return row
-    cfg = configure(settings)
-    row = {**asked, "parts": {name: summary(episodes(name, trials, seed, cfg)) for name in NAMES}}
+    found = configure(settings, cfg.base)
+    parts = {name: summary(episodes(name, cfg.trials, cfg.seed, found, cfg.severity)) for name in NAMES}
+    row = {**asked, "parts": parts}
     with log.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
     return row
@@ -137,25 +180,24 @@ def _score(row: Row) -> tuple[int, float]:
     return sum(p["reached"] for p in parts), -round(float(np.mean(rmse)) / _SAME_MM) if rmse else -np.inf
 
 
-def tune(trials: int, seed: int, log: Path) -> Iterator[Row]:
+def tune(cfg: TuneCfg, log: Path) -> Iterator[Row]:
     """Runs the search.
 
     Args:
-        trials: Of each part and setting.
-        seed: Of the first trial.
+        cfg: What is tuned, and on what.
         log: A file of JSON lines, one for each setting.
 
     Yields:
         A row for each setting as it ends; the last one is the best again.
     """
-    settings = {name: _default(name) for name in CHOICES}
-    best = _evaluate(settings, trials, seed, log)
+    settings = {name: _value(cfg.base, name) for name in cfg.choices}
+    best = _evaluate(settings, cfg, log)
     yield best
-    for name, values in CHOICES.items():
+    for name, values in cfg.choices.items():
         for value in values:
             if value == settings[name]:
                 continue
-            row = _evaluate({**settings, name: value}, trials, seed, log)
+            row = _evaluate({**settings, name: value}, cfg, log)
             yield row
             if _score(row) > _score(best):
                 best = row
@@ -163,8 +205,7 @@ def tune(trials: int, seed: int, log: Path) -> Iterator[Row]:
     yield best
 
 
-def _default(name: str) -> float:
-    cfg = AdaptiveCfg()
+def _value(cfg: AdaptiveCfg, name: str) -> float:
     return float(cfg.depth.look_ahead_m) if name == "look_ahead_m" else getattr(cfg, name)
 
 
@@ -177,10 +218,11 @@ def table(rows: Sequence[Row]) -> str:
     Returns:
         One line a setting: reached of trials and RMSE in mm of each part.
     """
-    head = [*CHOICES, *NAMES]
+    names = list(rows[0]["settings"])
+    head = [*names, *NAMES]
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     for row in rows:
-        cells = [f"{row['settings'][name]:g}" for name in CHOICES]
+        cells = [f"{row['settings'][name]:g}" for name in names]
         for part in row["parts"].values():
             rmse = "-" if part["rmse_mm"] is None else f"{part['rmse_mm']:.3f}"
             cells.append(f"{part['reached']}/{part['trials']}, {rmse}")
@@ -198,19 +240,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=20, help="of each part and setting")
     parser.add_argument("--seed", type=int, default=FIRST_VALIDATION_SEED, help="of the first trial")
+    parser.add_argument("--severity", type=float, default=0.0, help="of MovingWorkpiece; 0: parts at rest")
+    parser.add_argument("--plain", action="store_true", help="tune the variant as published")
     parser.add_argument("--out", type=Path, required=True, help="folder for tune_adaptive.jsonl and .md")
     args = parser.parse_args(argv)
     try:
-        require(args.trials >= 1, f"--trials {args.trials}: must be at least 1")
-        require(
-            FIRST_VALIDATION_SEED <= args.seed <= _FIRST_TABLE_SEED - args.trials,
-            f"--seed {args.seed}: tuning is for {FIRST_VALIDATION_SEED}..{_FIRST_TABLE_SEED - 1}",
-        )
+        cfg = TuneCfg(trials=args.trials, seed=args.seed, severity=args.severity, plain=args.plain)
     except SealGymError as error:
         sys.exit(str(error))
     args.out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in tune(args.trials, args.seed, args.out / "tune_adaptive.jsonl"):
+    for row in tune(cfg, args.out / "tune_adaptive.jsonl"):
         rows.append(row)
         print(json.dumps(row), flush=True)
     text = table(rows[:-1]) + f"\nBest: {json.dumps(rows[-1]['settings'])}\n"

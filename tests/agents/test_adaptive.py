@@ -22,8 +22,11 @@ from agents.adaptive import (
 from seal_gym.core.errors import ConfigError
 from seal_gym.core.frames import transform, yaw_pose
 from seal_gym.envs.sb3 import SealSb3VecEnv
+from seal_gym.tasks.progress import SealTaskCfg
 
 CFG = AdaptiveCfg()
+PLAIN = AdaptiveCfg.plain()
+FORWARD, SPEED = np.array([0.0, 1.0, 0.0]), 0.01
 LEAN = np.sqrt(0.5)
 
 
@@ -32,11 +35,34 @@ def blind(cfg=CFG):
 
 
 def straight(length=0.01, n=30):
-    """A map along the base's y, and a pose that travels along it."""
+    """The plain variant's map along the base's y, and a pose that travels along it."""
     track = Track()
     for u in np.linspace(0.0, length, n):
-        track = extend(track, np.array([0.1, u, 0.2]), np.eye(4), CFG)._replace(landed=True)
+        track = join(track, np.array([0.1, u, 0.2]))._replace(landed=True)
     return track
+
+
+def join(track, point, cfg=PLAIN):
+    return extend(track, [point], 0.0, np.eye(4), cfg)
+
+
+def fit_at_rest(points, arc, cfg=PLAIN):
+    last = Path(np.array([points[0], FORWARD]), 0.0, 0.0, 0.0)
+    return fit(points, arc, np.zeros(len(arc)), FORWARD, cfg, last)
+
+
+def follow(cfg, seam, frames=60, rng=None):
+    """The map of a gun that travels along the base's y over a seam: ``seam(y, t)`` is its place at y."""
+    track, sigma = Track(), 0.0 if rng is None else 2e-5
+    for k in range(frames):
+        t = k / 30
+        tip = transform(np.eye(3), np.array([0.0, SPEED * t, 0.0]))
+        lines = [cfg.depth.look_ahead_m, cfg.depth.look_ahead_m + cfg.second_line_m]
+        points = [seam(tip[1, 3] + y, t) for y in lines[: 1 + (cfg.second_line_m > 0)]]
+        if rng is not None:
+            points = [p + sigma * rng.standard_normal(3) * [1, 0, 1] for p in points]
+        track = extend(track, points, t, tip, cfg)._replace(landed=True)
+    return track, tip, t
 
 
 # -- the map ---------------------------------------------------------------------------------------------
@@ -46,7 +72,7 @@ def test_a_polynomial_is_fitted_exactly():
     u = np.linspace(0.3, 0.31, 24)
     coefficients = np.array([[1.0, 2.0, 3.0], [0.6, 0.8, 0.0], [4.0, -3.0, 1.0]])
     points = np.vander(u - 0.3, 3, increasing=True) @ coefficients
-    path = fit(points, u, np.array([0.0, 1.0, 0.0]), CFG)
+    path = fit_at_rest(points, u)
     np.testing.assert_allclose(path.at(u), points, atol=1e-12)
     np.testing.assert_allclose(path.slope(0.3), coefficients[1], atol=1e-8)
     np.testing.assert_allclose(path.bend(0.3), 2 * coefficients[2], atol=1e-5)
@@ -58,33 +84,33 @@ def test_a_circle_is_followed_closely():
     radius = 0.07
     u = np.linspace(0.0, 0.008, 24)
     points = radius * np.column_stack((np.cos(u / radius), np.sin(u / radius), 0 * u))
-    path = fit(points, u, np.array([0.0, 1.0, 0.0]), CFG)
+    path = fit_at_rest(points, u)
     np.testing.assert_allclose(np.linalg.norm(path.at(u), axis=1), radius, atol=1e-6)
     assert np.linalg.norm(path.bend(0.004)) == pytest.approx(1 / radius, rel=1e-2)
 
 
 def test_few_points_go_straight_ahead():
     points = np.array([[0.0, 0.0, 0.0], [2e-5, 3e-4, 0.0], [-2e-5, 6e-4, 0.0]])
-    path = fit(points, np.array([0.0, 3e-4, 6e-4]), np.array([0.0, 1.0, 0.0]), CFG)
+    path = fit_at_rest(points, np.array([0.0, 3e-4, 6e-4]))
     np.testing.assert_allclose(path.slope(0.0), [0.0, 1.0, 0.0])
-    np.testing.assert_allclose(path.at(path.origin), [0.0, 3e-4, 0.0])
+    np.testing.assert_allclose(path.at(path.origin), [0.0, 3e-4, 0.0], atol=1e-15)
 
 
 def test_outliers_are_refused_until_they_persist():
     track = straight()
     far = np.array([0.105, 0.0103, 0.2])
     for k in range(1, CFG.patience + 1):
-        track = extend(track, far, np.eye(4), CFG)
+        track = join(track, far)
         assert track.outliers == k
         np.testing.assert_allclose(track.path.at(0.005)[[0, 2]], [0.1, 0.2], atol=1e-9)
-    begun = extend(track, far, np.eye(4), CFG)
+    begun = join(track, far)
     np.testing.assert_array_equal(begun.points, far[None])
     assert begun.landed
 
 
 def test_one_good_point_forgives_outliers():
-    track = extend(straight(), np.array([0.105, 0.0103, 0.2]), np.eye(4), CFG)
-    track = extend(track, np.array([0.1, 0.0104, 0.2]), np.eye(4), CFG)
+    track = join(straight(), np.array([0.105, 0.0103, 0.2]))
+    track = join(track, np.array([0.1, 0.0104, 0.2]))
     assert track.outliers == 0
     assert len(track.points) == CFG.window
 
@@ -92,21 +118,92 @@ def test_one_good_point_forgives_outliers():
 def test_points_are_kept_a_spacing_apart_and_only_the_last_ones():
     track = straight()
     assert len(track.points) == CFG.window
-    again = extend(track, track.points[-1] + [0.0, 1e-4, 0.0], np.eye(4), CFG)
+    again = join(track, track.points[-1] + [0.0, 1e-4, 0.0])
     np.testing.assert_array_equal(again.points, track.points)
-    more = extend(track, track.points[-1] + [0.0, 3e-4, 0.0], np.eye(4), CFG)
+    more = join(track, track.points[-1] + [0.0, 3e-4, 0.0])
     np.testing.assert_array_equal(more.points[:-1], track.points[1:])
     assert more.arc[-1] == pytest.approx(track.arc[-1] + 3e-4)
 
 
 def test_the_path_is_replanned_every_few_points():
-    cfg = replace(CFG, replan=3)
+    cfg = replace(PLAIN, replan=3)
     track = straight()
     ends = []
     for k in range(1, 7):
-        track = extend(track, np.array([0.1, 0.01 + 3e-4 * k, 0.2]), np.eye(4), cfg)
+        track = join(track, np.array([0.1, 0.01 + 3e-4 * k, 0.2]), cfg)
         ends.append(track.path.end)
     np.testing.assert_allclose(ends, 0.01 + 3e-4 * np.array([0, 0, 3, 3, 3, 6]), atol=1e-12)
+
+
+# -- the part's motion -----------------------------------------------------------------------------------
+
+
+def test_two_lines_tell_motion_from_slant():
+    velocity, slant = np.array([0.006, 0.0, -0.002]), 0.2
+    moving, tip, t = follow(CFG, lambda y, t: velocity * t + y * FORWARD)
+    path = moving.path
+    np.testing.assert_allclose(path.drift[0], velocity, atol=2e-6)
+    np.testing.assert_allclose(path.drift[1], 0.0, atol=2e-5)
+    # Abreast of the tip the seam was seen 0.3 s ago; the path holds for now.
+    here = path.at(abreast(path, tip, moving.at + tip[1, 3]))
+    np.testing.assert_allclose(here, velocity * t + tip[1, 3] * FORWARD, atol=2e-6)
+    np.testing.assert_allclose(
+        path.slope(path.end) / np.linalg.norm(path.slope(path.end)), FORWARD, atol=1e-3
+    )
+    resting, _, _ = follow(CFG, lambda y, t: np.array([slant * y, y, 0.0]))
+    np.testing.assert_allclose(resting.path.drift, 0.0, atol=1e-9)
+    slope = resting.path.slope(resting.path.end)
+    assert slope[0] / slope[1] == pytest.approx(slant)
+
+
+def test_a_part_that_speeds_up_is_followed():
+    accel = 0.004
+    track, tip, t = follow(CFG, lambda y, t: np.array([0.5 * accel * t * t, y, 0.0]))
+    assert track.path.drift[0, 0] == pytest.approx(accel * t, rel=0.02)
+    here = track.path.at(abreast(track.path, tip, tip[1, 3]))
+    assert here[0] == pytest.approx(0.5 * accel * t * t, abs=2e-5)
+    steady = replace(CFG, motion=1)
+    late, _, _ = follow(steady, lambda y, t: np.array([0.5 * accel * t * t, y, 0.0]))
+    assert late.path.drift[0, 0] < accel * (t - 0.1)  # the window's mean is late
+
+
+def test_noise_of_the_points_becomes_little_noise_of_the_motion():
+    rng, found = np.random.default_rng(5), []
+    for _ in range(10):
+        track, _, _ = follow(CFG, lambda y, t: np.array([0.005 * t, y, 0.0]), 45, rng)
+        found.append(track.path.drift[0, 0])
+    assert np.mean(found) == pytest.approx(0.005, abs=3e-4)
+    assert np.std(found) < 6e-4
+
+
+def test_one_line_is_late_by_what_the_part_moves_in_the_look_ahead():
+    velocity = 0.004
+    track, tip, t = follow(PLAIN, lambda y, t: np.array([velocity * t, y, 0.0]))
+    here = track.path.at(abreast(track.path, tip, track.path.end))
+    late = PLAIN.depth.look_ahead_m / SPEED
+    assert velocity * t - here[0] == pytest.approx(velocity * late, rel=1e-3)
+    # A resting seam of this slant gives the same points: no filter could tell.
+    slanted, _, _ = follow(PLAIN, lambda y, t: np.array([velocity / SPEED * (y - 0.003), y, 0.0]))
+    np.testing.assert_allclose(slanted.points, track.points, atol=1e-12)
+    with pytest.raises(ConfigError, match=r"second_line_m > 0, or motion=0"):
+        replace(PLAIN, motion=1)
+
+
+def test_a_path_moves_as_its_drift_says():
+    path = Path(
+        np.array([[0.1, 0.2, 0.3], FORWARD]), 0.0, 0.0, 0.0, np.array([[1.0, 0, 0], [0, 0, 4.0]]), 2.0
+    )
+    later = path.moved(2.5)
+    np.testing.assert_allclose(later.coefficients, [[0.6, 0.2, 0.8], FORWARD])  # v t, a t^2 / 2
+    np.testing.assert_allclose(later.drift, [[1.0, 0.0, 2.0], [0.0, 0.0, 4.0]])
+    np.testing.assert_allclose(later.moved(2.0).coefficients, path.coefficients, atol=1e-15)
+
+
+def test_the_servo_is_fed_the_seams_motion_but_not_along_the_seam():
+    drift = np.array([[0.003, 0.007, -0.002]])
+    path = Path(np.array([[0, 0, -3e-3], FORWARD]), 0.0, 0.01, 0.0, drift)
+    target = aim(path, 0.0, np.eye(4), SPEED, 0.003, 0.0)
+    np.testing.assert_allclose(target.reference, [0.003, SPEED, -0.002, 0, 0, 0], atol=1e-15)
 
 
 # -- the servo -------------------------------------------------------------------------------------------
@@ -191,8 +288,8 @@ def run(policy, env, seed, frames, state=None):
     return np.array(actions), info, state, observation
 
 
-def make(workpiece="flat"):
-    return gym.make("SealGym/Seal-v0", workpiece=workpiece, control="tip", perception="oracle")
+def make(workpiece="flat", **kwargs):
+    return gym.make("SealGym/Seal-v0", workpiece=workpiece, control="tip", perception="oracle", **kwargs)
 
 
 @pytest.mark.parametrize("workpiece", ["flat", "cylinder", "rectangular"])
@@ -203,6 +300,16 @@ def test_it_seals_parts_that_stand_still(workpiece):
     assert metrics["outcome"] == "reached"
     assert metrics["rmse_mm"] < 0.15
     assert metrics["coverage_pct"] > 90.0
+
+
+@pytest.mark.parametrize("workpiece", ["flat", "cylinder"])
+def test_it_seals_parts_that_move_and_the_published_method_does_not(workpiece):
+    env = make(workpiece, disturbances=["MovingWorkpiece"])
+    _, info, _, _ = run(Adaptive.of(env), env, 500_001, 5000)
+    assert info["episode_metrics"]["outcome"] == "reached"
+    assert info["episode_metrics"]["rmse_mm"] < 0.15
+    _, info, _, _ = run(Adaptive.of(env, PLAIN), env, 500_001, 5000)
+    assert not info["is_success"]
 
 
 def test_faces_and_repetitions_agree_to_the_bit():
@@ -248,7 +355,7 @@ def test_gone_blind_it_stops_at_the_end_of_its_path():
     for _ in range(60):
         action, state = policy.predict(observation, state, np.array([False]))
         observation, _, _, _, info = env.step(action)
-    left = CFG.depth.look_ahead_m + CFG.extrapolate_m
+    left = CFG.depth.look_ahead_m + CFG.second_line_m + CFG.extrapolate_m
     assert info["progress"] * 0.3 - before == pytest.approx(left, abs=8e-4)
     assert np.abs(env.unwrapped.core.tip.twist[0, :3]).max() < 5e-4
     assert not info["collision"]
@@ -287,7 +394,8 @@ def test_nonsense_is_refused(change):
 def test_tuning_takes_the_setting_that_reaches_most_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
     ran = []
 
-    def episodes(part, trials, seed, cfg):
+    def episodes(part, trials, seed, cfg, severity):
+        assert severity == 0.5
         ran.append((part, cfg.window, cfg.order))
         reached = cfg.window == 40
         rmse = 0.1 if cfg.order == 2 else 0.05
@@ -302,16 +410,55 @@ def test_tuning_takes_the_setting_that_reaches_most_and_goes_on_where_it_stopped
 
     monkeypatch.setattr(tune_adaptive, "episodes", episodes)
     log = tmp_path / "log.jsonl"
-    rows = list(tune_adaptive.tune(2, 500_000, log))
+    what = tune_adaptive.TuneCfg(trials=2, severity=0.5)
+    rows = list(tune_adaptive.tune(what, log))
     assert rows[-1]["settings"]["window"] == 40
     assert rows[-1]["settings"]["order"] == 1  # the first of two that are equal
     assert rows[-1]["parts"]["flat"] == {
         "trials": 2, "reached": 2, "collision": 0, "timeout": 0, "rmse_mm": 0.05, "time_s": 30.0
     }  # fmt: skip
     count = len(ran)
-    assert list(tune_adaptive.tune(2, 500_000, log)) == rows
+    assert list(tune_adaptive.tune(what, log)) == rows
     assert len(ran) == count
     assert "| 2/2, 0.050 |" in tune_adaptive.table(rows)
+    # Other conditions are other rows.
+    monkeypatch.setattr(tune_adaptive, "episodes", lambda *args: [RESULT] * 2)
+    plain = list(tune_adaptive.tune(tune_adaptive.TuneCfg(trials=2, plain=True), log))
+    assert plain[-1]["parts"]["flat"]["rmse_mm"] == RESULT["rmse_mm"]
+    assert "motion" not in plain[-1]["settings"]
+    assert tune_adaptive.configure(plain[-1]["settings"], PLAIN) == PLAIN
+
+
+RESULT = {"reached": True, "collision": False, "timeout": False, "rmse_mm": 0.7, "time_s": 30.0}
+
+
+def test_the_command_hands_the_severity_to_the_parts(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(tune_adaptive, "episodes", lambda *args: seen.append(args[-1]) or [RESULT])
+    tune_adaptive.main(["--trials", "1", "--severity", "0.5", "--out", str(tmp_path)])
+    assert set(seen) == {0.5}
+    with pytest.raises(SystemExit, match="severity"):
+        tune_adaptive.main(["--severity", "-1", "--out", str(tmp_path)])
+
+
+def test_severity_moves_the_part(monkeypatch):
+    made = []
+
+    class Spy(SealSb3VecEnv):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **{**kwargs, "task": SealTaskCfg(time_factor=0.01)})
+            made.append((self.core, []))
+
+        def step_wait(self):
+            made[-1][1].append(self.core.arm.part_pose.copy())
+            return super().step_wait()
+
+    monkeypatch.setattr(tune_adaptive, "SealSb3VecEnv", Spy)
+    for severity in (0.0, 1.0):
+        tune_adaptive.episodes("flat", 1, 500_000, severity=severity)
+    still, moving = (np.ptp(np.stack(poses), axis=0).max() for _, poses in made)
+    assert still == 0.0
+    assert moving > 1e-5
 
 
 def test_tuning_stays_on_validation_seeds(tmp_path):
