@@ -33,7 +33,7 @@ from seal_gym.sim.depth_seam import SeamPointCfg, find_seam
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _MAD_TO_SIGMA = 1.4826
 _NEWTON_STEPS = 3
-_REACH_M = 0.02  # from a path's end; nothing is looked for farther away
+_REACH_M = 0.1  # from a path's end; nothing is looked for farther away
 _Y = 1
 
 
