@@ -13,7 +13,8 @@ fixed speed. Two variants:
   has been, and what has changed there is motion. So the fit has columns of time beside those of arc length
   (velocity and acceleration of the part), points are moved along to the present, and the servo is fed
   forward. Seam trackers with several lines are sold, and the depth sensor that Zhou et al. put in the
-  laser's place sees an area. Motion along a straight seam cannot be seen, and is not needed there.
+  laser's place sees an area. Motion along a straight seam cannot be seen, and is not needed there; at a
+  corner it is, and a box that moves is still hit there at times. Zhou et al. report no such compensation.
 """
 
 from collections.abc import Sequence
