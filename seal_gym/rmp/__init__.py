@@ -11,6 +11,14 @@ back, sums them and solves for joint accelerations::
 from seal_gym.rmp.algebra import Leaf, Rmp, combine, gather, pullback
 from seal_gym.rmp.barriers import BarrierCfg, JointLimitCfg, ObstacleCfg, joint_limits, obstacle
 from seal_gym.rmp.cholesky import cholesky_metric, metric_size, metric_to_cholesky
+from seal_gym.rmp.clearance import (
+    SEALING_GUN,
+    Capsules,
+    Clearances,
+    LetPassCfg,
+    clearances,
+    let_pass,
+)
 from seal_gym.rmp.leaves import (
     AttractionCfg,
     DampingCfg,
@@ -44,14 +52,18 @@ from seal_gym.rmp.sealing import (
 )
 
 __all__ = [
+    "SEALING_GUN",
     "AttractionCfg",
     "BarrierCfg",
+    "Capsules",
+    "Clearances",
     "DampingCfg",
     "ForwardSpeedCfg",
     "HeadingCfg",
     "JointLimitCfg",
     "Leaf",
     "LeanCfg",
+    "LetPassCfg",
     "ObstacleCfg",
     "RegularisationCfg",
     "ResolveCfg",
@@ -65,6 +77,7 @@ __all__ = [
     "axis_errors",
     "blend",
     "cholesky_metric",
+    "clearances",
     "combine",
     "damping",
     "damping_squared",
@@ -75,6 +88,7 @@ __all__ = [
     "heading_side",
     "joint_limits",
     "lean",
+    "let_pass",
     "metric_size",
     "metric_to_cholesky",
     "obstacle",

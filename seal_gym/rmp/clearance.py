@@ -1,0 +1,196 @@
+"""How far the gun is from a ball, and the leaf that lets the ball pass.
+
+The gun is a handful of capsules on the tip's body. Of each the point nearest the ball is a control point: the
+ball's clearance from the capsule is a one-dimensional task, whose Jacobian is that of the point's position
+along the line to the ball.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from seal_gym.core.errors import require
+from seal_gym.core.frames import cross
+from seal_gym.core.kinematics import TipKinematics
+from seal_gym.rmp.algebra import Array, Leaf, apply
+from seal_gym.rmp.barriers import BarrierCfg, ObstacleCfg, barrier
+from seal_gym.rmp.leaves import Y
+
+_TINY_M = 1e-9  # a ball centred on a segment has no direction
+
+
+class Capsules(NamedTuple):
+    """Bodies that move with the tip, each all points within a radius of a line segment.
+
+    Attributes:
+        names: K of them.
+        start: Ends of the segments in the tip frame, shape (K, 3), m.
+        end: Their other ends, shape (K, 3), m.
+        radius: Shape (K,), m.
+    """
+
+    names: tuple[str, ...]
+    start: Array
+    end: Array
+    radius: Array
+
+
+def _capsules(**rows: tuple[tuple[float, ...], tuple[float, ...], float]) -> Capsules:
+    """Rows of start and end [mm] and radius [mm]."""
+    starts, ends, radii = zip(*rows.values(), strict=True)
+    arrays = tuple(1e-3 * np.array(values, dtype=np.float64) for values in (starts, ends, radii))
+    for array in arrays:
+        array.flags.writeable = False
+    return Capsules(tuple(rows), *arrays)
+
+
+SEALING_GUN = _capsules(
+    mouth=((0.0, 0.0, 5.5), (0.0, 0.0, 60.0), 6.1),
+    cartridge=((0.0, 0.0, 58.0), (0.0, 0.0, 118.0), 25.7),
+    front_camera=((0.0, 57.46, 100.14), (0.0, 69.31, 124.84), 14.8),
+    side_camera=((61.29, 8.0, 98.16), (75.64, 8.0, 121.49), 14.8),
+    holder=((0.0, 0.0, 128.0), (0.0, 0.0, 250.0), 38.9),
+    valve=((0.0, -68.5, 221.0), (0.0, -32.5, 221.0), 27.5),
+    wrist=((0.0, 0.0, 250.0), (0.0, 0.0, 379.0), 41.0),
+)
+"""The collision geoms of ``assets/ur5_sealgun`` from the mouth to wrist 2, which lies on the last joint's axis
+and so moves with the tip but for its turning about itself. Further up nothing is in reach of what stands
+beside a part: wrist 1 is 0.2 m above it."""
+
+
+class Clearances(NamedTuple):
+    """Clearances of K capsules from a ball in N simulations: ``G d/dt twist + drift`` is the second derivative.
+
+    Attributes:
+        distance: Negative inside, shape (N, K), m.
+        rate: Its time derivative with the ball's own motion, shape (N, K), m/s.
+        gradient: G, with respect to the motion of the tip: ``rate`` of a ball at rest is ``G twist``, shape
+            (N, K, 6).
+        drift: What is left of the second derivative with a constant body twist and a ball that does not
+            accelerate, shape (N, K), m/s^2.
+        point: The control points, nearest the ball on the segments, in the tip frame, shape (N, K, 3), m.
+    """
+
+    distance: Array
+    rate: Array
+    gradient: Array
+    drift: Array
+    point: Array
+
+
+def clearances(
+    tip: TipKinematics, centre: Array, velocity: Array, radius: float, bodies: Capsules = SEALING_GUN
+) -> Clearances:
+    """Clearances of capsules on the tip from a ball, with their derivatives.
+
+    Args:
+        tip: Kinematics of N arms.
+        centre: Of the ball in the base frame, shape (N, 3), m.
+        velocity: Of the ball, shape (N, 3), m/s.
+        radius: Of the ball [m].
+        bodies: K capsules.
+
+    Returns:
+        Of N simulations.
+    """
+    rotation = tip.pose[:, :3, :3]
+    ball = _turned_back(rotation, centre - tip.pose[:, :3, 3])
+    along = bodies.end - bodies.start
+    share = _dot(ball[:, None] - bodies.start, along) / _dot(along, along)
+    point = bodies.start + np.minimum(np.maximum(share, 0.0), 1.0)[..., None] * along
+    offset = point - ball[:, None]
+    length = np.maximum(np.sqrt(_dot(offset, offset)), _TINY_M)
+    normal = offset / length[..., None]
+
+    linear, angular = tip.twist[:, None, :3], np.broadcast_to(tip.twist[:, None, 3:], point.shape)
+    moving = linear + cross(angular, point)
+    relative = moving - _turned_back(rotation, velocity)[:, None]
+    rate = _dot(normal, relative)
+    sideways = relative - rate[..., None] * normal
+    # The nearest point slides along its segment, which takes this much of the curvature away.
+    slide = _dot(sideways, along) / length + _dot(normal, cross(angular, np.broadcast_to(along, point.shape)))
+    slides = (share > 0.0) & (share < 1.0)
+    drift = (
+        _dot(normal, cross(angular, moving))
+        + _dot(sideways, sideways) / length
+        - np.where(slides, slide**2 * length / _dot(along, along), 0.0)
+    )
+    return Clearances(
+        distance=length - bodies.radius - radius,
+        rate=rate,
+        gradient=np.concatenate((normal, cross(point, normal)), axis=-1),
+        drift=drift,
+        point=point,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LetPassCfg:
+    """How the gun lets an obstacle pass: it gives way along the seam first, and leaves the seam last.
+
+    Attributes:
+        along: Spring, damper and metric on the motion along the seam.
+        away: Those of the clearance itself, in whatever direction it takes.
+    """
+
+    along: BarrierCfg = field(default_factory=lambda: BarrierCfg(margin=0.02, omega_n=5.0))
+    away: ObstacleCfg = field(default_factory=lambda: ObstacleCfg(margin=0.008))
+
+    def __post_init__(self) -> None:
+        """Checks that giving way comes first."""
+        require(
+            self.away.margin <= self.along.margin,
+            f"LetPassCfg.away.margin is {self.away.margin} but along.margin is {self.along.margin}; make "
+            "the second the larger one, or the gun leaves the seam before it stops",
+        )
+
+
+LET_PASS = LetPassCfg()
+
+
+def let_pass(tip: TipKinematics, near: Clearances, cfg: LetPassCfg = LET_PASS) -> Leaf:
+    """Keeps the gun clear of a ball: stops it along the seam, and pushes it off only where that is too little.
+
+    Two rows for each capsule. One acts on the travel (the tip's y): below ``along.margin`` a spring back and
+    a damper, in the measure in which going back helps, and never forward. It leaves the directions across the
+    seam to those who follow it, so that a gun that waits stays on the seam. The other is ``obstacle``: below
+    ``away.margin`` it acts on the clearance, for a ball that comes from the side or too fast.
+
+    Args:
+        tip: Kinematics of N arms.
+        near: Their K clearances.
+        cfg: Margins and gains.
+
+    Returns:
+        A leaf on 2 K tasks, with a metric of zero beyond the margins.
+    """
+    distance, rate, gradient, bend, _ = near
+    back = np.maximum(-gradient[..., Y], 0.0)
+    # The damper holds the gun's own motion both ways, or the spring would throw it back; the ball's motion
+    # counts as it comes near: one that leaves must not draw the gun after it.
+    own = -back * tip.twist[:, None, Y]
+    coming = own + np.minimum(rate - own, 0.0)
+    spring, weight = barrier(distance, np.zeros_like(rate), cfg.along)
+    retreat = -back * (spring - 2.0 * cfg.along.zeta * cfg.along.omega_n * coming)
+    accel, push = barrier(distance, rate, cfg.away)
+
+    travel = np.broadcast_to(tip.jacobian[:, None, Y], (*distance.shape, tip.jacobian.shape[-1]))
+    still = np.broadcast_to(tip.drift[:, None, Y], distance.shape)
+    drift = apply(gradient, tip.drift) + bend
+    weights = np.concatenate((weight * back**2, push), axis=-1)
+    return Leaf(
+        jacobian=np.concatenate((travel, np.matmul(gradient, tip.jacobian)), axis=-2),
+        drift=np.concatenate((still, drift), axis=-1),
+        accel=np.concatenate((retreat, accel), axis=-1),
+        metric=weights[..., None] * np.eye(weights.shape[-1]),
+    )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray((a * b).sum(axis=-1))
+
+
+def _turned_back(rotation: Array, vector: Array) -> Array:
+    """Vectors of the base frame in the tip frames. Shape (N, 3)."""
+    return np.matmul(vector[:, None], rotation)[:, 0]
