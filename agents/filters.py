@@ -15,27 +15,10 @@ from seal_gym.core.cell import LimitsCfg
 from seal_gym.core.errors import ConfigError, require
 from seal_gym.core.frames import Array
 from seal_gym.envs.core import SealCore
-from seal_gym.rmp import Clearances, clearances
+from seal_gym.rmp import Clearances, LetPassCfg, allowed_speed, clearances
 from seal_gym.rmp.leaves import TWIST, Y
 
 _SWEEPS = 60  # of the projection onto K constraints; seven change by less than 1e-9 after about 30
-
-
-@dataclass(frozen=True, kw_only=True)
-class BrakeCfg:
-    """A stopping-distance monitor on the travel along the seam.
-
-    Attributes:
-        room_m: Clearance at which the gun must stand [m].
-        brake_m_s2: Deceleration it reckons with [m/s^2].
-    """
-
-    room_m: float = 0.010
-    brake_m_s2: float = 0.2
-
-    def __post_init__(self) -> None:
-        """Checks the ranges."""
-        _positive(self, "room_m", "brake_m_s2")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +33,7 @@ class CbfCfg:
     """
 
     room_m: float = 0.010
-    omega_n: float = 5.0
+    omega_n: float = 12.0
     cross_cost: float = 100.0
 
     def __post_init__(self) -> None:
@@ -67,14 +50,13 @@ def _positive(cfg: object, *names: str) -> None:
 class Filter(Protocol):
     """Corrects tip accelerations."""
 
-    def __call__(self, accel: Array, twist: Array, near: Clearances, dt: float) -> Array:
+    def __call__(self, accel: Array, twist: Array, near: Clearances) -> Array:
         """The accelerations to command instead.
 
         Args:
             accel: Wanted, shape (N, 6), m/s^2 and rad/s^2.
             twist: Of the tips, shape (N, 6), m/s and rad/s.
             near: Clearances of N guns.
-            dt: Time of a frame [s].
 
         Returns:
             Shape (N, 6).
@@ -82,27 +64,23 @@ class Filter(Protocol):
 
 
 class Brake:
-    """Bounds the speed along the seam by the distance in which the gun can stop.
+    """Bounds the speed along the seam as the leaf does: a protective stop (ISO/TS 15066) that eases in."""
 
-    The usual protective stop (ISO/TS 15066's speed and separation monitoring): a body whose clearance shrinks
-    by ``b`` for each metre of travel may travel at ``sqrt(2 a (d - room)) / b``. It never goes back.
-    """
-
-    def __init__(self, cfg: BrakeCfg | None = None) -> None:
+    def __init__(self, cfg: LetPassCfg | None = None) -> None:
         """Takes the gains.
 
         Args:
-            cfg: Room and deceleration.
+            cfg: Of the leaf; its margin, room and rates.
         """
-        self._cfg = cfg or BrakeCfg()
+        self._cfg = cfg or LetPassCfg()
 
-    def __call__(self, accel: Array, twist: Array, near: Clearances, dt: float) -> Array:
+    def __call__(self, accel: Array, twist: Array, near: Clearances) -> Array:
         """See ``Filter``."""
-        free = np.maximum(near.distance - self._cfg.room_m, 0.0)
-        closing = np.maximum(-near.gradient[..., Y], 1e-3)
-        allowed = (np.sqrt(2.0 * self._cfg.brake_m_s2 * free) / closing).min(axis=1)
+        cfg = self._cfg
+        within = near.distance < cfg.margin
+        allowed = np.where(within, allowed_speed(near, cfg), np.inf).min(axis=1)
         out = accel.copy()
-        out[:, Y] = np.minimum(accel[:, Y], (allowed - twist[:, Y]) / dt)
+        out[:, Y] = np.minimum(accel[:, Y], cfg.gain_s * (allowed - twist[:, Y]))
         return out
 
 
@@ -125,9 +103,9 @@ class Cbf:
         weight[Y] = 1.0
         self._inverse = 1.0 / weight
 
-    def __call__(self, accel: Array, twist: Array, near: Clearances, dt: float) -> Array:
+    def __call__(self, accel: Array, twist: Array, near: Clearances) -> Array:
         """See ``Filter``."""
-        del twist, dt
+        del twist
         omega = self._cfg.omega_n
         least = -near.drift - 2.0 * omega * near.rate - omega**2 * (near.distance - self._cfg.room_m)
         return least_change(accel, near.gradient, least, self._inverse)
@@ -158,7 +136,19 @@ def least_change(wanted: Array, rows: Array, least: Array, inverse_weight: Array
     return out
 
 
-FILTERS: dict[str, Callable[[], Filter]] = {"brake": Brake, "cbf": Cbf}
+class BrakeThenCbf:
+    """A ``Brake`` with a ``Cbf`` behind it that keeps less room: the two stages of the leaf."""
+
+    def __init__(self) -> None:
+        """Builds both; the barrier acts where the leaf's push begins."""
+        self._brake, self._cbf = Brake(), Cbf(CbfCfg(room_m=LetPassCfg().away.margin))
+
+    def __call__(self, accel: Array, twist: Array, near: Clearances) -> Array:
+        """See ``Filter``."""
+        return self._cbf(self._brake(accel, twist, near), twist, near)
+
+
+FILTERS: dict[str, Callable[[], Filter]] = {"brake": Brake, "cbf": Cbf, "brake_cbf": BrakeThenCbf}
 """What can stand between direct control and the arm."""
 
 
@@ -187,7 +177,6 @@ class Filtered:
         limits: LimitsCfg = core.cfg.cell.limits
         self._policy, self._core, self._filter = policy, core, keep_off
         self._scale = np.array([limits.linear_m_s2] * 3 + [limits.angular_rad_s2] * 3)
-        self._dt = core.cfg.cell.timing.frame_s
 
     def predict(
         self,
@@ -214,5 +203,5 @@ class Filtered:
             return action, state
         near = clearances(arms.tip, ball.position, ball.velocity, ball.radius)
         wanted = np.clip(action, -1.0, 1.0).reshape(-1, TWIST).astype(np.float64) * self._scale
-        accel = self._filter(wanted, arms.tip.twist, near, self._dt) / self._scale
+        accel = self._filter(wanted, arms.tip.twist, near) / self._scale
         return np.clip(accel, -1.0, 1.0).astype(np.float32).reshape(action.shape), state

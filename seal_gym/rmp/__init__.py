@@ -16,6 +16,7 @@ from seal_gym.rmp.clearance import (
     Capsules,
     Clearances,
     LetPassCfg,
+    allowed_speed,
     clearances,
     let_pass,
 )
@@ -72,6 +73,7 @@ __all__ = [
     "SeamErrors",
     "ServoCfg",
     "TipRmp",
+    "allowed_speed",
     "attraction_front",
     "attraction_side",
     "axis_errors",

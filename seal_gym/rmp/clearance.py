@@ -14,9 +14,11 @@ from seal_gym.core.errors import require
 from seal_gym.core.frames import cross
 from seal_gym.core.kinematics import TipKinematics
 from seal_gym.rmp.algebra import Array, Leaf, apply
-from seal_gym.rmp.barriers import BarrierCfg, ObstacleCfg, barrier
+from seal_gym.rmp.barriers import ObstacleCfg, barrier
+from seal_gym.rmp.checks import require_positive
 from seal_gym.rmp.leaves import Y
 
+_SIDEWAYS = 1e-3  # share of the travel that counts as towards a body at its side
 _TINY_M = 1e-9  # a ball centred on a segment has no direction
 
 
@@ -127,35 +129,60 @@ def clearances(
 
 @dataclass(frozen=True, kw_only=True)
 class LetPassCfg:
-    """How the gun lets an obstacle pass: it gives way along the seam first, and leaves the seam last.
+    """How the gun lets an obstacle pass: it stops along the seam first, and leaves the seam last."""
 
-    Attributes:
-        along: Spring, damper and metric on the motion along the seam.
-        away: Those of the clearance itself, in whatever direction it takes.
-    """
-
-    along: BarrierCfg = field(default_factory=lambda: BarrierCfg(margin=0.02, omega_n=5.0))
+    margin: float = 0.03
+    """Clearance below which the speed along the seam is bounded [m]."""
+    room: float = 0.010
+    """Clearance at which the gun stands [m]."""
+    closing_s: float = 1.0
+    """Allowed speed towards the obstacle for each metre of clearance beyond ``room`` [1/s]."""
+    retreat_m_s: float = 0.002
+    """Largest speed back along the seam [m/s]. Small: policies have not learned to go back."""
+    gain_s: float = 8.0
+    """Deceleration for each m/s of excess speed [1/s]."""
+    excess_m_s: float = 0.002
+    """Excess speed at which the bound has its full metric [m/s]; there is none below the bound."""
+    weight: float = 100.0
+    """Metric of the bound at distance zero; tip leaves have about 1."""
     away: ObstacleCfg = field(default_factory=lambda: ObstacleCfg(margin=0.008))
+    """Spring, damper and metric of the clearance itself, in whatever direction it takes."""
 
     def __post_init__(self) -> None:
-        """Checks that giving way comes first."""
+        """Checks the ranges, and that stopping comes first."""
+        require_positive(self, "margin", "room", "closing_s", "retreat_m_s", "gain_s", "excess_m_s", "weight")
         require(
-            self.away.margin <= self.along.margin,
-            f"LetPassCfg.away.margin is {self.away.margin} but along.margin is {self.along.margin}; make "
-            "the second the larger one, or the gun leaves the seam before it stops",
+            self.away.margin <= self.room <= self.margin,
+            f"LetPassCfg has away.margin {self.away.margin}, room {self.room} and margin {self.margin}; give "
+            "them in rising order, or the gun leaves the seam before it stops",
         )
 
 
 LET_PASS = LetPassCfg()
 
 
+def allowed_speed(near: Clearances, cfg: LetPassCfg = LET_PASS) -> Array:
+    """Speed along the seam at which each clearance shrinks no faster than its room allows.
+
+    Args:
+        near: Clearances of K capsules in N simulations.
+        cfg: Room and rates.
+
+    Returns:
+        At least ``-retreat_m_s``; huge where going on costs no clearance. Shape (N, K), m/s.
+    """
+    towards = np.maximum(-near.gradient[..., Y], _SIDEWAYS)
+    return np.maximum(cfg.closing_s * (near.distance - cfg.room) / towards, -cfg.retreat_m_s)
+
+
 def let_pass(tip: TipKinematics, near: Clearances, cfg: LetPassCfg = LET_PASS) -> Leaf:
     """Keeps the gun clear of a ball: stops it along the seam, and pushes it off only where that is too little.
 
-    Two rows for each capsule. One acts on the travel (the tip's y): below ``along.margin`` a spring back and
-    a damper, in the measure in which going back helps, and never forward. It leaves the directions across the
-    seam to those who follow it, so that a gun that waits stays on the seam. The other is ``obstacle``: below
-    ``away.margin`` it acts on the clearance, for a ball that comes from the side or too fast.
+    Two rows for each capsule. One acts on the travel (the tip's y): below ``margin`` it bounds its speed by
+    ``allowed_speed``, in the measure in which going back helps, and never drives the gun forward. It leaves
+    the directions across the seam to those who follow it, so that a gun that waits stays on the seam. The
+    other is ``obstacle``: below ``away.margin`` it acts on the clearance, for a ball that comes from the side
+    or too fast.
 
     Args:
         tip: Kinematics of N arms.
@@ -166,23 +193,20 @@ def let_pass(tip: TipKinematics, near: Clearances, cfg: LetPassCfg = LET_PASS) -
         A leaf on 2 K tasks, with a metric of zero beyond the margins.
     """
     distance, rate, gradient, bend, _ = near
-    back = np.maximum(-gradient[..., Y], 0.0)
-    # The damper holds the gun's own motion both ways, or the spring would throw it back; the ball's motion
-    # counts as it comes near: one that leaves must not draw the gun after it.
-    own = -back * tip.twist[:, None, Y]
-    coming = own + np.minimum(rate - own, 0.0)
-    spring, weight = barrier(distance, np.zeros_like(rate), cfg.along)
-    retreat = -back * (spring - 2.0 * cfg.along.zeta * cfg.along.omega_n * coming)
+    excess = np.maximum(tip.twist[:, None, Y] - allowed_speed(near, cfg), 0.0)
+    depth = np.maximum(1.0 - distance / cfg.margin, 0.0)
+    towards = np.maximum(-gradient[..., Y], 0.0)
+    bound = cfg.weight * (depth * towards) ** 2 * np.minimum(excess / cfg.excess_m_s, 1.0)
     accel, push = barrier(distance, rate, cfg.away)
 
     travel = np.broadcast_to(tip.jacobian[:, None, Y], (*distance.shape, tip.jacobian.shape[-1]))
     still = np.broadcast_to(tip.drift[:, None, Y], distance.shape)
     drift = apply(gradient, tip.drift) + bend
-    weights = np.concatenate((weight * back**2, push), axis=-1)
+    weights = np.concatenate((bound, push), axis=-1)
     return Leaf(
         jacobian=np.concatenate((travel, np.matmul(gradient, tip.jacobian)), axis=-2),
         drift=np.concatenate((still, drift), axis=-1),
-        accel=np.concatenate((retreat, accel), axis=-1),
+        accel=np.concatenate((-cfg.gain_s * excess, accel), axis=-1),
         metric=weights[..., None] * np.eye(weights.shape[-1]),
     )
 
