@@ -1,4 +1,4 @@
-"""Safety filters for policies that command the tip's acceleration: what direct control has in place of a leaf.
+"""Safety filters for policies that command the tip's acceleration: direct control's answer to a leaf.
 
 They know what the obstacle leaf knows: the same clearances of the same capsules, the ball's motion included.
 """
