@@ -3,7 +3,7 @@
     python -m experiments.obstacle --trials 25 --seed 500000 --jobs 2 --out out/obstacle
 
 ``MovingObstacle`` in the way of the neural RMP, alone and with an obstacle leaf added at run time, and of
-direct control, alone and behind filters that know what the leaf knows. Writes obstacle.json, .csv, .md and one
+direct control, alone and behind filters that know what the leaf knows. Writes obstacle.json, .csv, .md and a
 picture for each part. Trials are logged as they end: the same command goes on where it was stopped.
 """
 
@@ -249,9 +249,9 @@ def markdown(table: Sequence[Row]) -> str:
         for r in table
     ]
     note = (
-        "A fist of 45 mm radius reaches over the wall into the gun's way, stays and withdraws. 95 % intervals. "
-        "RMSE and time: of trials that reached. Detour: largest distance from the desired path while the fist is out. "
-        "Clearance: smallest distance of gun and arm from the fist. Other: lost, or out of time."
+        "A fist of 45 mm radius reaches over the wall into the gun's way, stays and withdraws. 95 % "
+        "intervals. RMSE and time: of trials that reached. Detour: largest distance from the desired path while "
+        "the fist is out. Clearance: smallest distance of gun and arm from the fist. Other: lost, or out of time."
     )
     return f"{note}\n\n{results.grid(head, body)}"
 

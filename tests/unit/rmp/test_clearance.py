@@ -112,7 +112,7 @@ def test_the_capsules_hold_the_gun():
 def test_nothing_beyond_the_margin():
     tip = tip_kinematics(Q, QD)
     far, _, radius = ball_in_base()
-    near = clearances(tip, far + [0.0, 0.0, 0.5], SPEED, radius)
+    near = clearances(tip, far + np.array([0.0, 0.0, 0.5]), SPEED, radius)
     leaf = let_pass(tip, near)
     assert not leaf.metric.any()
     other = joint_limits(Q, QD, JOINT_LOWER + 2.5, -JOINT_LOWER)
