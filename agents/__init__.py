@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.expert import RmpExpert
 from seal_gym.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -61,8 +60,15 @@ def _adaptive(env: Any) -> Policy:
     return Adaptive.of(env)
 
 
+# Imported when asked for: what they import takes MuJoCo with it, whose OpenGL backend is chosen by then.
+def _expert(cell: "CellCfg | None") -> Policy:
+    from agents.expert import RmpExpert
+
+    return RmpExpert(cell)
+
+
 def _pid_servo(cell: "CellCfg | None") -> Policy:
-    from agents.pid_servo import PidServo  # a command line of its own, and imports mujoco
+    from agents.pid_servo import PidServo
 
     return PidServo(cell)
 
@@ -100,7 +106,7 @@ def _from_weights(path: Path, cell: "CellCfg | None", kind: str | None = None) -
 
 
 POLICIES: dict[str, NamedPolicy] = {
-    "rmp_expert": NamedPolicy("rmp", RmpExpert),
+    "rmp_expert": NamedPolicy("rmp", _expert),
     "pid_servo": NamedPolicy("tip", _pid_servo),
     "adaptive": NamedPolicy("tip", _adaptive, senses=True),
     "neural_rmp": NamedPolicy("rmp", _learned("neural_rmp")),

@@ -3,6 +3,8 @@ import io
 import json
 import pickle
 import shutil
+import subprocess
+import sys
 import zipfile
 
 import gymnasium as gym
@@ -27,6 +29,14 @@ NEURAL = (*KINDS, *DAGGER)
 
 def make(control="tip"):
     return gym.make("SealGym/Flat-v0", control=control, perception="oracle")
+
+
+@pytest.mark.parametrize("module", ["agents", "agents.backend", "experiments.backend"])
+def test_mujoco_is_imported_after_its_backend_can_be_chosen(module):
+    """``python -m agents.enjoy`` imports the package first, and MuJoCo reads ``MUJOCO_GL`` once."""
+    code = f"import sys, {module}; print([m for m in ('mujoco', 'torch') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
 
 
 @pytest.fixture
