@@ -125,8 +125,8 @@ def make(options: argparse.Namespace) -> str:
     pictures = [f"fig14_{part}.png"]
     if run.frames:
         captions = [
-            f"t = {r['time_s']:.1f} s    part shifted {r['shift_mm']:.0f} mm, turned {r['yaw_deg']:+.0f} deg    "
-            f"tip error {r['tip_error_mm']:.2f} mm"
+            f"t = {r['time_s']:.1f} s    part shifted {r['shift_mm']:.0f} mm, turned {r['yaw_deg']:+.0f} deg"
+            f"    tip error {r['tip_error_mm']:.2f} mm"
             for r in rows
         ]
         draw_frames(out / f"{NAME}_{part}.png", title, run, shown(run), captions)

@@ -154,7 +154,8 @@ class RmpAdapter:
         """
         policy = TipRmp(action[:, :6] * self._scale, cholesky_metric(CHOLESKY_SCALE * action[:, 6:]))
         # Blind, the gun comes to rest.
-        reference = reference_twist(np.where(state.seen, self._speed, 0.0), state.seam_twist)
+        speed = np.where(state.seen, self._speed, 0.0)
+        reference = reference_twist(speed, state.seam_twist, self._sealing)
         fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
         return {"policy": policy, **dict(zip(FIXED_POLICIES, fixed, strict=True))}
 

@@ -46,6 +46,7 @@ from seal_gym.rmp.resolve import ResolveCfg, damping_squared, resolve
 from seal_gym.rmp.sealing import (
     SealingCfg,
     SeamErrors,
+    TravelCfg,
     axis_errors,
     fixed_policies,
     reference_twist,
@@ -73,6 +74,7 @@ __all__ = [
     "SeamErrors",
     "ServoCfg",
     "TipRmp",
+    "TravelCfg",
     "allowed_speed",
     "attraction_front",
     "attraction_side",

@@ -46,12 +46,13 @@ def _usual(
     view: int,
     mask: Bools,
     line: Array,
+    followed: int,
     section: Array,
     par: TrackNumbers,
     state: TrackState,
     s: Scratch,
 ) -> bool:
-    """Whether plate and wall beside the expected line are as bright as they usually are.
+    """Whether plate and wall beside the followed edge, or else the expected line, are as bright as usual.
 
     A hand or a shadow that comes in changes them from one frame to the next; the wall beyond a corner changes
     them slowly. After a jump they have to be nearer to the usual ones; what stays for longer than the
@@ -65,8 +66,16 @@ def _usual(
     # In the side view the wall changes too much at corners; the height's gate guards it.
     for side in range(view, 2):
         total, count = 0.0, 0
-        for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
-            o = line[1] + line[2] * (row + 0.5 - line[0])
+        # Beyond a corner the expected line has the plate on both sides; the edge knows better.
+        steps = followed if followed > 0 else min(int(line[0] + par.ahead_px), height) - max(int(line[0]), 0)
+        for step in range(steps):
+            if followed > 0:
+                row, o = int(s.points[step, 0] + line[0]), s.points[step, 1]
+                if row < line[0]:
+                    continue
+            else:
+                row = max(int(line[0]), 0) + step
+                o = line[1] + line[2] * (row + 0.5 - line[0])
             first = int(o + half) + 2 if side == 1 else int(o - half) - 1 - _BESIDE
             for x in range(max(first, 0), min(first + _BESIDE, width)):
                 if not mask[row, x]:
@@ -120,7 +129,6 @@ def track_front(
     plate_axes(d, par.plate, n, m)
     seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0
     seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
-    seen = seen and _usual(i, 0, mask, line, section, par, state, s)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
@@ -137,7 +145,10 @@ def track_front(
             s.profile,
             s.points,
         )
-        seen = count >= MIN_ROWS
+        line[0] = ref[0]
+        line[1] = o
+        enough = count >= MIN_ROWS
+        seen = _usual(i, 0, mask, line, count if enough else 0, section, par, state, s) and enough
         if seen:
             state.clock[i] += 1
             remember(i, tip, count, ref, g, par, state, s)
@@ -295,7 +306,7 @@ def track_side(
         return False
     if not section_of(p, d, n, m, 1, g, par.groove, section):
         return False
-    if not _usual(i, 1, mask, line, section, par, state, s):
+    if not _usual(i, 1, mask, line, 0, section, par, state, s):
         return False
     if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return False
