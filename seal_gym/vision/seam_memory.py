@@ -13,7 +13,7 @@ _ONSET_M = 0.5e-3  # more than a part gathers in a frame
 _REACH = 4.5  # how far along motion is looked for, in widths of the fit
 _SLOPE_OVER = 3  # neighbours on either side from which an edge's slope is taken
 _GAP_M = 2.0e-3  # farther apart new edges have nothing between them
-_ALONG = 0.02  # mean square of slopes about their mean with which a shift along the seam is half believed
+_ALONG = 0.06  # mean square of slopes about their mean with which a shift along the seam is half believed
 _FADE = 0.03  # share of a velocity along the seam that is forgotten in a frame that does not show it
 
 
@@ -167,7 +167,8 @@ def fit_memory(
     if count < MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
     shift = np.empty(3)
-    seam_motion(fit, count, sigma, clip, shift)
+    # A part that sets off moves its oldest edges the most: what is robust must not be deaf.
+    seam_motion(fit, count, sigma, 0.5 * par.jump_m, shift)
     off = shift[0]
     if abs(off) > par.jump_m:
         # No part moves like this: something else passes the camera or, if it stays, the part was shoved.
