@@ -17,6 +17,7 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
+_BEND_GAIN, _TURNED = 0.06, 0.2  # how slopes follow the edge, and what change of slope is a bend
 # From above a plate the side view answers to a bend four times as much as in a fillet: its far rows are the
 # less sure, as the root, because a bend's error grows with the square of the way. And the bend is known to
 # about this share, which this far from the tip looks like a change of the plane's height and pitch.
@@ -66,21 +67,20 @@ def _usual(
     # In the side view the wall changes too much at corners; the height's gate guards it.
     for side in range(view, 2):
         total, count = 0.0, 0
-        # Beyond a corner the expected line has the plate on both sides; the edge knows better.
-        steps = followed if followed > 0 else min(int(line[0] + par.ahead_px), height) - max(int(line[0]), 0)
-        for step in range(steps):
-            if followed > 0:
-                row, o = int(s.points[step, 0] + line[0]), s.points[step, 1]
-                if row < line[0]:
-                    continue
-            else:
-                row = max(int(line[0]), 0) + step
-                o = line[1] + line[2] * (row + 0.5 - line[0])
+        o, slope, next_point = line[1] + line[2] * (int(line[0]) + 0.5 - line[0]), line[2], 0
+        for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
+            if next_point < followed and int(line[0] + s.points[next_point, 0]) == row:
+                error = s.points[next_point, 1] - o
+                o, slope = o + error, slope + _BEND_GAIN * error
+                next_point += 1
+            elif next_point >= followed and abs(slope - line[2]) > _TURNED:
+                break  # beyond a corner the plate is on both sides
             first = int(o + half) + 2 if side == 1 else int(o - half) - 1 - _BESIDE
             for x in range(max(first, 0), min(first + _BESIDE, width)):
                 if not mask[row, x]:
                     total += s.grey[row, x]
                     count += 1
+            o += slope
         level, last = state.level[i, view, side], state.last[i, view, side]
         fresh[side] = total / (3.0 * count) if count >= _BESIDE else last
         if level >= 0.0:
@@ -148,7 +148,10 @@ def track_front(
         line[0] = ref[0]
         line[1] = o
         enough = count >= MIN_ROWS
-        seen = _usual(i, 0, mask, line, count if enough else 0, section, par, state, s) and enough
+        ahead = 0
+        while ahead < count and s.points[ahead, 0] > 0.0:
+            ahead += 1
+        seen = _usual(i, 0, mask, line, ahead if enough else 0, section, par, state, s) and enough
         if seen:
             state.clock[i] += 1
             remember(i, tip, count, ref, g, par, state, s)
