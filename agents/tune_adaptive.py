@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from agents.adaptive import Adaptive, AdaptiveCfg
-from agents.rollouts import FIRST_VALIDATION_SEED
+from agents.episodes import FIRST_VALIDATION_SEED
 from seal_gym.core.errors import SealGymError, require
 from seal_gym.envs.sb3 import SealSb3VecEnv
 from seal_gym.workpieces.catalogue import NAMES

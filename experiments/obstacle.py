@@ -22,7 +22,7 @@ import numpy as np
 
 import agents
 from agents.filters import FILTERS, Filtered
-from experiments import results, trials
+from experiments import command, results, trials
 from experiments.trials import Row, Trial
 from seal_gym.core.errors import ConfigError, SealGymError
 from seal_gym.envs.config import PERCEPTIONS
@@ -121,7 +121,7 @@ def clearance_m(core: SealCore) -> float:
     model, data = core.scene.model, core.arm.data(0)
     gun = [g for g in range(model.ngeom) if model.geom(g).name.startswith(GUN_PREFIX + "col_")]
     ball = model.geom(OBSTACLE).id
-    return min(mujoco.mj_geomDistance(model, data, g, ball, _FAR_M, None) for g in gun)
+    return min(float(mujoco.mj_geomDistance(model, data, g, ball, _FAR_M, None)) for g in gun)
 
 
 def run(trial: Trial) -> Row:
@@ -158,7 +158,7 @@ def run(trial: Trial) -> Row:
         if done or core.frames[0] % _EVERY == 0:
             sample = (core.seconds(0), 1e3 * clearance_m(core), 1e3 * core.progress.s[0])
             trace.append([round(float(v), 3) for v in (*sample, info["tip_error_mm"])])
-    env.close()
+    env.close()  # type: ignore[no-untyped-call]  # gymnasium 0.29 leaves it untyped
     return {
         "method": trial.method,
         "aid": aid,
@@ -363,14 +363,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--out", type=Path, default=Path("out/obstacle"), help="folder (default: %(default)s)"
     )
-    options = parser.parse_args(arguments)
-    for name, least in (("trials", 1), ("jobs", 1), ("seed", 0)):
-        if getattr(options, name) < least:
-            parser.error(f"--{name} {getattr(options, name)}: must be at least {least}")
+    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if not 0.0 < options.severity <= 20.0:
         parser.error(f"--severity {options.severity}: must be in (0, 20]")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out {options.out}: is a file, must be a folder")
     return options
 
 

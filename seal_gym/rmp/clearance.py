@@ -217,4 +217,4 @@ def _dot(a: Array, b: Array) -> Array:
 
 def _turned_back(rotation: Array, vector: Array) -> Array:
     """Vectors of the base frame in the tip frames. Shape (N, 3)."""
-    return np.matmul(vector[:, None], rotation)[:, 0]
+    return np.asarray(np.matmul(vector[:, None], rotation)[:, 0])
