@@ -70,13 +70,13 @@ class AdaptiveCfg:
     depth: DepthCfg = field(default_factory=DepthCfg)
     seam: SeamPointCfg = field(default_factory=SeamPointCfg)
     second_line_m: float = 1.5e-3
-    motion: int = 2
+    motion: int = 1
     point_m: float = 5e-5
     velocity_m_s: float = 5e-3
     accel_m_s2: float = 1e-2
-    window: int = 24
+    window: int = 12
     replan: int = 1
-    order: int = 2
+    order: int = 3
     spacing_m: float = 2e-4
     span_m: float = 2e-3
     gate_mad: float = 3.0
