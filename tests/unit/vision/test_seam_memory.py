@@ -35,10 +35,10 @@ def corner(y):
 @pytest.mark.parametrize("along", [-0.1e-3, 0.0, 0.08e-3])
 def test_a_corner_shows_motion_across_and_along(across, along):
     shift = moved(corner, across, along)
-    assert shift[0] == pytest.approx(across, abs=0.005e-3)
-    assert shift[2] > 0.6
-    # The prior takes a fifth of it, and chords between edges lie inside the arc.
-    assert shift[1] == pytest.approx(along, abs=0.025e-3)
+    assert shift[0] == pytest.approx(across, abs=0.01e-3)
+    # The prior leaves more than half of what is along, and chords between edges lie inside the arc.
+    assert 0.5 < shift[2] < 0.7
+    assert shift[1] == pytest.approx(shift[2] * along, abs=0.025e-3)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.3, -0.5])
