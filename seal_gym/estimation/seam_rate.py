@@ -75,7 +75,7 @@ class SeamRate:
             shape (N, 6), m/s and rad/s.
     """
 
-    def __init__(self, n: int, dt_s: float, gain: float = 0.7) -> None:
+    def __init__(self, n: int, dt_s: float, gain: float = 0.4) -> None:
         """Starts without a line.
 
         Args:

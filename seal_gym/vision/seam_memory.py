@@ -134,11 +134,12 @@ def seam_motion(fit: Array, count: int, sigma: float, clip: float, out: Array) -
     if s0 <= 0.0:
         return
     # About the mean slope the two do not mix. The edges of a frame share its noise, so that their number
-    # says little: the prior grows with it.
-    mean, seen = s1 / s0, s2 - s1 * s1 / s0
-    out[1] = -(b1 - mean * b0) / (seen + _ALONG * s0)
+    # says little; and in a slight bend chords inside the arc pass for motion: squares leave that out.
+    mean, seen = s1 / s0, s2 / s0 - (s1 / s0) ** 2
+    out[2] = seen * seen / (seen * seen + _ALONG * _ALONG)
+    if seen > 0.0:
+        out[1] = -(b1 - mean * b0) / (seen * s0) * out[2]
     out[0] = b0 / s0 + mean * out[1]
-    out[2] = seen / (seen + _ALONG * s0)
 
 
 @kernel
