@@ -57,7 +57,7 @@ class PerceptionCfg:
     level_change: tuple[float, float] = (40.0, 12.0)
     level_step: tuple[float, float] = (7.0, 6.0)
     level_gain: float = 0.15
-    memory_s: float = 1.0
+    memory_s: float = 0.7
     ahead_px: float = 26.0
     sigma_m: float = 2.0 * _MM
     bend: float = 80.0
