@@ -131,13 +131,13 @@ def clearances(
 class LetPassCfg:
     """How the gun lets an obstacle pass: it stops along the seam first, and leaves the seam last."""
 
-    margin: float = 0.03
+    margin: float = 0.06
     """Clearance below which the speed along the seam is bounded [m]."""
-    room: float = 0.010
+    room: float = 0.025
     """Clearance at which the gun stands [m]."""
     closing_s: float = 1.0
     """Allowed speed towards the obstacle for each metre of clearance beyond ``room`` [1/s]."""
-    retreat_m_s: float = 0.002
+    retreat_m_s: float = 0.0002
     """Largest speed back along the seam [m/s]. Small: policies have not learned to go back."""
     gain_s: float = 8.0
     """Deceleration for each m/s of excess speed [1/s]."""
@@ -145,7 +145,7 @@ class LetPassCfg:
     """Excess speed at which the bound has its full metric [m/s]; there is none below the bound."""
     weight: float = 100.0
     """Metric of the bound at distance zero; tip leaves have about 1."""
-    away: ObstacleCfg = field(default_factory=lambda: ObstacleCfg(margin=0.008))
+    away: ObstacleCfg = field(default_factory=lambda: ObstacleCfg(margin=0.010))
     """Spring, damper and metric of the clearance itself, in whatever direction it takes."""
 
     def __post_init__(self) -> None:

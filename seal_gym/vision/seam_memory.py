@@ -14,6 +14,8 @@ _REACH = 4.5  # how far along motion is looked for, in widths of the fit
 _SLOPE_OVER = 3  # neighbours on either side from which an edge's slope is taken
 _GAP_M = 2.0e-3  # farther apart new edges have nothing between them
 _ALONG = 0.06  # mean square of slopes about their mean with which a shift along the seam is half believed
+_STEP_M = 0.25e-3  # travel or motion after which a frame's edges are kept beside the last ones
+_CARRIED_M = 0.1e-3
 _FADE = 0.03  # share of a velocity along the seam that is forgotten in a frame that does not show it
 
 
@@ -158,12 +160,10 @@ def fit_memory(
 ) -> bool:
     """Fits what is remembered near the tip in the plate's plane, and learns how the part moves across."""
     sigma, clip = par.sigma_m, par.clip_m
-    # The tangent moves little in a frame, which matters where the edges seen lie off the tip.
-    prior = (
-        1.0 / par.step_m**2,
-        1.0 / (par.step_rad * sigma) ** 2,
-        1.0 / (par.bend * sigma * sigma) ** 2,
-    )
+    # The tangent moves little in a frame, which matters where the edges seen lie off the tip. As long as no
+    # edges behind the tip are remembered, heading and bend are hard to tell apart: seams seldom begin in one.
+    bend = par.bend * min(max(state.clock[i], 1) / par.memory, 1.0)
+    prior = (1.0 / par.step_m**2, 1.0 / (par.step_rad * sigma) ** 2, 1.0 / (bend * sigma * sigma) ** 2)
     count = _gather(i, tip, p, d, n, m, sigma, oldest, state, fit)
     if count < MIN_ROWS or fit_curve(fit[0], fit[1], fit[2], count, prior, clip, curve) <= 0.0:
         return False
@@ -199,6 +199,34 @@ def fit_memory(
     curve[1] /= sigma
     curve[2] /= sigma * sigma
     return True
+
+
+@kernel
+def travel(i: int, tip: Array, d: Array, state: TrackState) -> None:
+    """Adds up how far tip and part have gone since the last page: the one over the other, and the part."""
+    for a in range(3):
+        state.carried[i, a] += state.velocity[i, a]
+        along = tip[a, 0] * d[0] + tip[a, 1] * d[1] + tip[a, 2] * d[2]
+        state.gone[i] += (tip[a, 3] - state.tip[i, a] - state.velocity[i, a]) * along
+
+
+@kernel
+def turn_page(i: int, state: TrackState) -> None:
+    """Makes room for the frame's edges: beside the last ones if something moved, else in their place.
+
+    So a gun that waits keeps the edges behind the tip, which it does not see; with those ahead alone heading
+    and bend could trade places, and the gun would sway. On a part that moves edges have to be young.
+    """
+    moved = state.carried[i, 0] ** 2 + state.carried[i, 1] ** 2 + state.carried[i, 2] ** 2
+    if abs(state.gone[i]) >= _STEP_M or moved >= _CARRIED_M * _CARRIED_M:
+        state.gone[i] = state.carried[i, 0] = state.carried[i, 1] = state.carried[i, 2] = 0.0
+        state.clock[i] += 1
+        state.page[i] = state.head[i]
+        return
+    for k in range(state.stamp.shape[1]):
+        if state.stamp[i, k] == state.clock[i]:
+            state.stamp[i, k] = -1
+    state.head[i] = state.page[i]
 
 
 @kernel

@@ -153,9 +153,12 @@ class TrackState(NamedTuple):
     point: Array  # the tangent's point nearest the tip, world, (N, 3), m
     direction: Array  # its direction of travel, world, (N, 3)
     variance: Array  # of the plane's height and pitch, (N, 2)
+    tip: Array  # where the tip was in the frame before, world, (N, 3), m
+    gone: Array  # the tip's travel over the part since the last page, (N,), m
+    carried: Array  # the part's motion since then, world, (N, 3), m
     tracking: Bools  # (N,)
     missed: NDArray[np.int64]  # frames without the seam, (N, 2)
-    clock: NDArray[np.int64]  # frames in which the front view showed the seam, (N,)
+    clock: NDArray[np.int64]  # pages of the memory, one for each step of travel or motion, (N,)
     level: Array  # usual grey levels beside the line, views by sides, -1 before the first, (N, 2, 2)
     last: Array  # those of the frame before, -1 likewise
     steady: NDArray[np.int64]  # frames since they jumped, (N, 2)
@@ -163,8 +166,9 @@ class TrackState(NamedTuple):
     eye: Array  # remembered rays: optical centre, world, (N, K, 3), m
     ray: Array  # direction, (N, K, 3)
     weight: Array  # (N, K)
-    stamp: NDArray[np.int64]  # frame of each, -1 for none, (N, K)
+    stamp: NDArray[np.int64]  # page of each, -1 for none, (N, K)
     head: NDArray[np.int64]  # where the next ray goes, (N,)
+    page: NDArray[np.int64]  # where the last page begins, (N,)
 
 
 class EdgeMaps(NamedTuple):
@@ -236,6 +240,8 @@ class Scratch(NamedTuple):
 def forget(i: int, state: TrackState) -> None:
     """Gives one simulation's track up."""
     state.tracking[i] = False
+    state.clock[i] = 0
+    state.gone[i] = np.inf  # the first frame begins a page
     state.missed[i, 0] = state.missed[i, 1] = 0
     for a in range(3):
         state.velocity[i, a] = 0.0

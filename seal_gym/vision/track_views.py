@@ -8,7 +8,7 @@ from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
 from seal_gym.vision.groove import CUTS, SECTION, cuts_at, section_of
 from seal_gym.vision.seam_line import NARROW_PX, LineNumbers, follow, row_edge
-from seal_gym.vision.seam_memory import fit_memory, remember
+from seal_gym.vision.seam_memory import fit_memory, remember, travel, turn_page
 from seal_gym.vision.strip_geometry import normalise, plate_axes, strip_slope, to_strip
 from seal_gym.vision.track_state import MIN_ROWS, Scratch, TrackNumbers, TrackState
 
@@ -126,6 +126,7 @@ def track_front(
     Returns whether the front view showed the seam; without, the memory carries on.
     """
     line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
+    travel(i, tip, d, state)
     plate_axes(d, par.plate, n, m)
     seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0
     seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
@@ -153,7 +154,7 @@ def track_front(
             ahead += 1
         seen = _usual(i, 0, mask, line, ahead if enough else 0, section, par, state, s) and enough
         if seen:
-            state.clock[i] += 1
+            turn_page(i, state)
             remember(i, tip, count, ref, g, par, state, s)
     oldest = max(state.clock[i] - int(par.memory), 0)
     fitted = fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)

@@ -11,7 +11,7 @@ from agents.filters import FILTERS, Brake, BrakeThenCbf, Cbf, CbfCfg, Filtered, 
 from seal_gym.core.errors import ConfigError
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
-from seal_gym.rmp import Clearances
+from seal_gym.rmp import Clearances, LetPassCfg
 
 Y = 1
 
@@ -54,9 +54,12 @@ def test_far_from_everything_nothing_changes(name):
     np.testing.assert_array_equal(got, wanted)
 
 
-@pytest.mark.parametrize("keep_off", [Brake(), Cbf(CbfCfg(room_m=0.01)), BrakeThenCbf()])
-def test_a_point_that_pushes_on_stops_short(keep_off):
-    """Straight at a wall 60 mm off, whatever it wants: it comes close, stops, and never touches."""
+@pytest.mark.parametrize(
+    ("keep_off", "room"),
+    [(Brake(), LetPassCfg().room), (Cbf(CbfCfg(room_m=0.01)), 0.01), (BrakeThenCbf(), LetPassCfg().room)],
+)
+def test_a_point_that_pushes_on_stops_short(keep_off, room):
+    """Straight at a wall 60 mm off, whatever it wants: it comes to the room it keeps, and stops there."""
     position, speed, dt = 0.0, 0.02, 1 / 120
     for _ in range(2400):
         near = one_body(0.06 - position, -speed)
@@ -64,9 +67,9 @@ def test_a_point_that_pushes_on_stops_short(keep_off):
         twist = np.array([[0.0, speed, 0.0, 0.0, 0.0, 0.0]])
         accel = keep_off(wanted, twist, near)[0, Y]
         position, speed = position + speed * dt + 0.5 * accel * dt**2, speed + accel * dt
-        assert position < 0.06 - 0.007
+        assert position < 0.06 - room + 0.003
     assert abs(speed) < 1e-3
-    assert position > 0.06 - 0.012
+    assert position > 0.06 - room - 0.002
 
 
 def test_it_brakes_rather_than_leave_the_seam():

@@ -148,7 +148,7 @@ def test_it_bounds_the_speed_along_the_seam_and_nothing_else():
 
 
 def test_it_pushes_off_what_is_too_near():
-    cfg = LetPassCfg(away=ObstacleCfg(margin=0.008))
+    cfg = LetPassCfg(away=ObstacleCfg(margin=0.008), retreat_m_s=0.002)
     tip, near = ahead_of_camera(0.004, 0.0)
     leaf = let_pass(tip, near, cfg)
     row = 7 + 2
