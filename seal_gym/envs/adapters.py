@@ -217,13 +217,16 @@ class JointAdapter:
         return action * self._scale
 
 
-def make_adapter(control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...]) -> Adapter:
+def make_adapter(
+    control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...], sealing: SealingCfg | None = None
+) -> Adapter:
     """The adapter of a control mode.
 
     Args:
         control: ``"tip"``, ``"rmp"`` or ``"joint"``.
         cell: The cell.
         leaves: The user's leaves, for ``"rmp"``.
+        sealing: Configuration of the fixed leaves, for ``"rmp"``.
 
     Returns:
         The adapter.
@@ -238,7 +241,7 @@ def make_adapter(control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...]) 
     if control == "tip":
         return TipAdapter(cell)
     if control == "rmp":
-        return RmpAdapter(cell, leaves)
+        return RmpAdapter(cell, leaves, sealing)
     if control == "joint":
         return JointAdapter(cell)
     raise ConfigError(f"control = {control!r}: must be one of {list(CONTROLS)}")

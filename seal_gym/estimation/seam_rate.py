@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 
+SEAM_RATE_GAIN = 0.4
 _SPAN = 2
 """Frames between which the line is compared. Over one, a tip that shakes by the frame would see the seam of a
 bend shake with it, and what is fed forward would keep it shaking; over two this drops out."""
@@ -75,7 +76,7 @@ class SeamRate:
             shape (N, 6), m/s and rad/s.
     """
 
-    def __init__(self, n: int, dt_s: float, gain: float = 0.4) -> None:
+    def __init__(self, n: int, dt_s: float, gain: float = SEAM_RATE_GAIN) -> None:
         """Starts without a line.
 
         Args:

@@ -178,7 +178,7 @@ def fit_memory(
             if (state.stamp[i, k] == state.clock[i]) != shoved:
                 state.stamp[i, k] = -1
         return False
-    along = max(min(shift[1], _ONSET_M), -_ONSET_M)
+    along = par.along_gain * max(min(shift[1], _ONSET_M), -_ONSET_M)
     across = max(min(shift[0], _ONSET_M), -_ONSET_M)
     unseen = 0.0
     for a in range(3):

@@ -48,6 +48,7 @@ class PerceptionCfg:
         gate: Measurements this many standard deviations off are not believed.
         follow_gain: Share of the new edges' drift against the memory by which the memory follows.
         velocity_gain: Share of that drift added to the part's velocity a frame.
+        along_gain: Share of the drift along the seam, which bends show, that both take.
     """
 
     edges: EdgeCfg = field(default_factory=EdgeCfg)
@@ -72,13 +73,14 @@ class PerceptionCfg:
     gate: float = 5.0
     follow_gain: float = 0.4
     velocity_gain: float = 0.1
+    along_gain: float = 1.0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         for name in ("coast_s", "search_s", "level_gain",
                      "memory_s", "ahead_px", "sigma_m", "bend", "step_m", "step_rad", "clip_m",
                      "jump_m", "row_sigma_m", "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
-                     "velocity_gain"):  # fmt: skip
+                     "velocity_gain", "along_gain"):  # fmt: skip
             value = getattr(self, name)
             require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
         for name in ("level_change", "level_step"):
@@ -112,6 +114,7 @@ class TrackNumbers(NamedTuple):
     level_gain: float
     follow_gain: float
     velocity_gain: float
+    along_gain: float
     plate: tuple[float, float, float]
     groove: tuple[float, float, float]
 
