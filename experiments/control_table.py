@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import agents
+from agents import engines
+from agents.engines import Engine
 from experiments import command, control_figures, control_report, methods, results, shapes, trials
 from experiments.methods import METHODS, Weights
 from experiments.trials import Row, Trial
@@ -120,12 +122,12 @@ def plan(table: TableCfg, options: argparse.Namespace) -> Plan:
     )
 
 
-def run(what: Plan, *, jobs: int, log: Path) -> tuple[list[Row], list[Row], list[Row]]:
+def run(what: Plan, *, engine: Engine, log: Path) -> tuple[list[Row], list[Row], list[Row]]:
     """Runs the plan, each trial once.
 
     Args:
         what: The plan.
-        jobs: Processes.
+        engine: Where it runs.
         log: See ``trials.run_all``.
 
     Returns:
@@ -133,7 +135,7 @@ def run(what: Plan, *, jobs: int, log: Path) -> tuple[list[Row], list[Row], list
     """
     groups = (what.main, what.seeds, what.other)
     wanted = {_identity(t): t for group in groups for t in group}
-    rows = trials.run_all(wanted.values(), jobs=jobs, log=log, title="sealing", together=trials.TOGETHER)
+    rows = trials.run_all(wanted.values(), engine=engine, log=log, title="sealing", together=trials.TOGETHER)
     ran = dict(zip(wanted, rows, strict=True))
     main, seeds, other = ([ran[_identity(t)] for t in group] for group in groups)
     return main, seeds, other
@@ -300,6 +302,7 @@ def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     )
     parser.add_argument("--perception", default=PERCEPTIONS[0], choices=PERCEPTIONS)
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+    engines.add_options(parser)
     parser.add_argument("--out", type=Path, default=Path("out") / name, help="folder (default: %(default)s)")
     parser.add_argument("--redraw", action="store_true", help="draw the figures of a table in OUT again")
 
@@ -323,7 +326,8 @@ def main(table: TableCfg, arguments: list[str] | None = None) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         last = options.seed + max(options.trials, options.shape_trials) - 1
         results.log_run(table.name, table.number, last)
-        ran = run(what, jobs=options.jobs, log=options.out / f"{table.name}.trials.jsonl")
+        engine = engines.of(options, trials.code)
+        ran = run(what, engine=engine, log=options.out / f"{table.name}.trials.jsonl")
         text = write(table, what, ran, options)
     except SealGymError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 import agents
+from agents import engines
 from agents.filters import FILTERS, Filtered
 from experiments import command, results, trials
 from experiments.trials import Row, Trial
@@ -383,7 +384,9 @@ def main(arguments: list[str] | None = None) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         results.log_run(NAME, "Obstacle", options.seed + options.trials - 1)
         log = options.out / f"{NAME}.trials.jsonl"
-        rows = trials.run_all(plan(options), jobs=options.jobs, log=log, title="passing", work=run)
+        rows = trials.run_all(
+            plan(options), engine=engines.local(options.jobs), log=log, title="passing", work=run
+        )
         text = write(rows, options)
     except SealGymError as error:
         sys.stderr.write(f"error: {error}\n")

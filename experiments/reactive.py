@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import agents
+from agents import engines
 from agents.expert import RmpExpert
 from agents.rollouts import play_once
 from experiments import command, results, trials
@@ -306,7 +307,9 @@ def main(arguments: list[str] | None = None) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         results.log_run(NAME, "Reactive control", options.seed + options.trials - 1)
         log = options.out / f"{NAME}.trials.jsonl"
-        rows = trials.run_all(plan(options), jobs=options.jobs, log=log, title="sealing", work=run)
+        rows = trials.run_all(
+            plan(options), engine=engines.local(options.jobs), log=log, title="sealing", work=run
+        )
         text = write(rows, options)
     except SealGymError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from agents import engines
+from agents.engines import Engine
 from experiments import (
     command,
     control_table,
@@ -78,19 +80,19 @@ def plan(options: argparse.Namespace) -> tuple[list[Point], list[Weights]]:
     return [*calm, *(point(name, s) for name in chosen for s in levels if s > 0)], weights
 
 
-def run(points: list[Point], *, jobs: int, log: Path) -> list[Row]:
+def run(points: list[Point], *, engine: Engine, log: Path) -> list[Row]:
     """Runs the plan.
 
     Args:
         points: The plan.
-        jobs: Processes.
+        engine: Where it runs.
         log: See ``trials.run_all``.
 
     Returns:
         One row a trial, with ``disturbance`` and ``severity``.
     """
     wanted = [t for p in points for t in p.trials]
-    rows = trials.run_all(wanted, jobs=jobs, log=log, title="disturbed", together=trials.TOGETHER)
+    rows = trials.run_all(wanted, engine=engine, log=log, title="disturbed", together=trials.TOGETHER)
     under = [{"disturbance": p.disturbance, "severity": p.severity} for p in points for _ in p.trials]
     light = [{k: v for k, v in row.items() if k != "path_mm"} for row in rows]
     return [{**where, **row} for where, row in zip(under, light, strict=True)]
@@ -185,7 +187,8 @@ def main(arguments: list[str] | None = None) -> int:
         points, weights = plan(options)
         options.out.mkdir(parents=True, exist_ok=True)
         results.log_run(NAME, "severity curves", options.seed + options.trials - 1)
-        ran = run(points, jobs=options.jobs, log=options.out / f"{NAME}.trials.jsonl")
+        engine = engines.of(options, trials.code)
+        ran = run(points, engine=engine, log=options.out / f"{NAME}.trials.jsonl")
         text = write(ran, weights, options)
     except SealGymError as error:
         sys.stderr.write(f"error: {error}\n")
