@@ -1,4 +1,4 @@
-"""Policies: the RMP expert, and what has learned from it."""
+"""Policies: the RMP expert, what has learned from it, and classical baselines."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,11 +45,19 @@ class NamedPolicy:
 
     Attributes:
         control: The ``control`` its environment needs.
-        make: Builds it for a cell (None: the one it was made for).
+        make: Builds it for a cell (None: the one it was made for); if it senses, for an environment.
+        senses: Whether it has a sensor of its own, to be mounted in the environment.
     """
 
     control: str
-    make: Callable[["CellCfg | None"], Policy]
+    make: Callable[[Any], Policy]
+    senses: bool = False
+
+
+def _adaptive(env: Any) -> Policy:
+    from agents.adaptive import Adaptive  # imports mujoco
+
+    return Adaptive.of(env)
 
 
 # Imported when asked for: what they import takes MuJoCo with it, whose OpenGL backend is chosen by then.
@@ -100,6 +108,7 @@ def _from_weights(path: Path, cell: "CellCfg | None", kind: str | None = None) -
 POLICIES: dict[str, NamedPolicy] = {
     "rmp_expert": NamedPolicy("rmp", _expert),
     "pid_servo": NamedPolicy("tip", _pid_servo),
+    "adaptive": NamedPolicy("tip", _adaptive, senses=True),
     "neural_rmp": NamedPolicy("rmp", _learned("neural_rmp")),
     "neural_rmp_identity": NamedPolicy("rmp", _learned("neural_rmp_identity")),
     "neural_control": NamedPolicy("tip", _learned("neural_control")),
@@ -158,7 +167,8 @@ def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Polic
             wrote (``NAME.safetensors``); or of a model that Stable-Baselines3 saved (``NAME.zip``), of which
             the parameters are read and the policy built anew.
         env: The environment it will act in, single or vectorised: checked against the policy's control mode,
-            and the source of the cell's calibration.
+            and the source of the cell's calibration. A policy with a sensor of its own (``adaptive``) needs
+            it, and acts in no other.
         trust_zip: Lets Stable-Baselines3 load a ``.zip``, which can run any code that is in it: for models
             that cannot be built anew (custom policies, images), from a source you trust.
 
@@ -166,8 +176,8 @@ def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Polic
         The policy.
 
     Raises:
-        ConfigError: If there is no such policy, it has no weights yet, or the environment's control mode or
-            cell is another.
+        ConfigError: If there is no such policy, it has no weights yet, the environment's control mode or
+            cell is another, or a policy that senses is given no environment.
         PolicyFileError: If a file is missing, damaged or no policy.
     """
     found = _find(name, trust_zip)
@@ -179,4 +189,4 @@ def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Polic
             f"policy {name!r} acts with control={found.control!r}, the environment has {cfg.control!r}: "
             f"make it with control={found.control!r}"
         )
-    return found.make(cfg.cell)
+    return found.make(env if found.senses else cfg.cell)

@@ -13,8 +13,6 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -23,10 +21,10 @@ from typing import Any
 from gymnasium import spaces
 from tqdm import tqdm
 
-from agents import demos, episodes, remote
-from agents.episodes import FIRST_VALIDATION_SEED, CollectCfg, Episode, Work
-from agents.processes import pool
-from agents.provenance import ROOT, code_hash, commit, stack
+from agents import demos, engines, episodes
+from agents.engines import Engine
+from agents.episodes import FIRST_VALIDATION_SEED, CollectCfg, Work
+from agents.provenance import code_hash, commit, stack
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
@@ -35,10 +33,7 @@ from seal_gym.tasks.progress import SealTaskCfg
 
 _PLAN = "collect.json"
 _SAME = ("seed", "config", "code", "stack")  # what a collection must have in common with its continuation
-_RETRIES = 10
 DATASET_ID = "seal_gym/demonstrations-v0"
-
-Engine = Callable[[list[Work]], Iterator[list[Episode]]]
 
 
 # -- what is collected ----------------------------------------------------------------------------------
@@ -101,102 +96,6 @@ def works(missing: list[int], batch: int, seed: int, cfg: CollectCfg) -> list[Wo
             Work(indices=tuple(mine[i : i + batch]), seed=seed, cfg=cfg) for i in range(0, len(mine), batch)
         ]
     return sorted(units, key=lambda w: w.indices)
-
-
-# -- engines --------------------------------------------------------------------------------------------
-
-
-def run_locally(jobs: int) -> Engine:
-    """Runs units in processes of this machine.
-
-    Args:
-        jobs: Number of processes.
-
-    Returns:
-        The engine.
-    """
-
-    def engine(units: list[Work]) -> Iterator[list[Episode]]:
-        if jobs == 1:
-            yield from map(episodes.run, units)
-            return
-        with pool(jobs) as workers:
-            try:
-                for future in as_completed([workers.submit(episodes.run, w) for w in units]):
-                    yield future.result()
-            except BrokenProcessPool:
-                raise SealGymError(
-                    "a worker process was ended from outside (out of memory?): start the same command again, "
-                    "with fewer --jobs if need be; it goes on where it stopped"
-                ) from None
-            finally:
-                workers.shutdown(wait=False, cancel_futures=True)
-
-    return engine
-
-
-def run_on_ray(jobs: int, address: str | None, send_code: bool = False) -> Engine:
-    """Runs units on a Ray cluster; what a lost worker or node was on runs again elsewhere.
-
-    Args:
-        jobs: Processors of the cluster that is started on this machine if there is no address.
-        address: Of a running cluster.
-        send_code: Whether the nodes get the code from here, and compile it; else each has this checkout at
-            the same path. A node with other code is refused.
-
-    Returns:
-        The engine.
-
-    Raises:
-        ConfigError: If Ray is not installed or the cluster not found.
-    """
-    try:
-        import ray
-    except ImportError:
-        raise ConfigError("--engine ray: Ray is not installed: pip install 'seal-gym[ray]'") from None
-    environment: dict[str, Any] = {"env_vars": {"OMP_NUM_THREADS": "1"}}
-    if send_code:
-        environment |= {"working_dir": str(ROOT), "excludes": list(_NOT_SENT)}
-    else:
-        environment["env_vars"]["PYTHONPATH"] = str(ROOT)
-    start: dict[str, Any] = {} if address is not None else {"num_cpus": jobs, "include_dashboard": False}
-    try:
-        ray.init(address=address, runtime_env=environment, log_to_driver=False, **start)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ConfigError(
-            f"--address {address}: no Ray cluster there ({error}); start one with ray start --head"
-        ) from None
-
-    def engine(units: list[Work]) -> Iterator[list[Episode]]:
-        task = ray.remote(num_cpus=1, max_retries=_RETRIES)(remote.run_checked)
-        code = code_hash()
-        waiting = [task.remote(w, code) for w in units]
-        try:
-            while waiting:
-                done, waiting = ray.wait(waiting, num_returns=1)
-                yield ray.get(done[0])
-        except ray.exceptions.RayError as error:
-            raise SealGymError(
-                f"the Ray cluster failed: {error}\nstart the same command again; it goes on where it stopped"
-            ) from None
-        finally:
-            ray.shutdown()
-
-    return engine
-
-
-_NOT_SENT = (
-    ".git",
-    ".ci",
-    ".venv*",
-    "out",
-    "dist",
-    "build",
-    "tests",
-    "experiments",
-    "agents/data",
-    "**/__pycache__",
-)
 
 
 # -- the collection -------------------------------------------------------------------------------------
@@ -285,7 +184,7 @@ def collect(out: Path, wanted: dict[str, Any], cfg: CollectCfg, engine: Engine, 
         bar = tqdm(total=count, initial=count - len(missing), desc="collect", unit="episode", smoothing=0.1)
         steps = 0
         with bar:
-            for done in engine(works(missing, batch, meta["seed"], cfg)) if missing else ():
+            for _, done in engine(episodes.run, works(missing, batch, meta["seed"], cfg)):
                 for episode in done:
                     demos.write_episode(data, episode)
                     steps += len(episode.rewards)
@@ -324,25 +223,13 @@ def parser() -> argparse.ArgumentParser:
         default=1,
         help="episodes that a job runs side by side: more is faster, and a kill loses as many (default: 1)",
     )
-    p.add_argument(
-        "--engine", choices=("local", "ray"), default="local", help="where to run (default: local)"
-    )
-    p.add_argument("--address", help="of a running Ray cluster; without one, --jobs workers on this machine")
-    p.add_argument(
-        "--send-code",
-        action="store_true",
-        help="send the code to the cluster's nodes; else each has this checkout at the same path",
-    )
+    engines.add_options(p)
     p.add_argument(
         "--wide",
         action="store_true",
         help="beyond the paper: rotation rates up to 40 deg/s, not 10, for larger heading errors",
     )
     return p
-
-
-def _ray(args: argparse.Namespace) -> Engine:
-    return run_on_ray(args.jobs, args.address, args.send_code)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -357,13 +244,8 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     cfg = CollectCfg.wide() if args.wide else CollectCfg()
     try:
-        require(
-            args.engine == "ray" or (args.address is None and not args.send_code),
-            "--address and --send-code: only with --engine ray",
-        )
         wanted = plan(args.episodes, args.seed, cfg)
-        engine = _ray(args) if args.engine == "ray" else run_locally(args.jobs)
-        steps = collect(args.out, wanted, cfg, engine, args.batch)
+        steps = collect(args.out, wanted, cfg, engines.of(args, code_hash), args.batch)
     except SealGymError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

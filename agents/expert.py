@@ -63,7 +63,7 @@ class RmpExpert:
         seen = np.where(now.seen, 1.0, 0.0)
         d_front, theta_front, d_side, theta_side, lean = now.errors
         errors = SeamErrors(seen * d_front, seen * theta_front, seen * d_side, seen * theta_side, lean)
-        reference = reference_twist(seen * self._cell.process.speed_m_s, now.seam_twist)
+        reference = reference_twist(seen * self._cell.process.speed_m_s, now.seam_twist, self._sealing)
         policy = blend(seam_policies(errors, now.twist, reference, self._sealing))
         action = np.concatenate(
             (policy.accel / self._scale, metric_to_cholesky(policy.metric) / CHOLESKY_SCALE), axis=1

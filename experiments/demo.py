@@ -16,6 +16,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 import agents
+from agents import engines
 from experiments import command, results, trials
 from experiments.pictures import Recorder
 from seal_gym.core.errors import RenderError, SealGymError
@@ -120,9 +121,8 @@ def main(arguments: list[str] | None = None) -> int:
             for name in chosen
             for k in range(options.trials)
         ]
-        rows = trials.run_all(
-            wanted, jobs=options.jobs, log=options.out / "demo.trials.jsonl", title="sealing"
-        )
+        engine = engines.local(options.jobs)
+        rows = trials.run_all(wanted, engine=engine, log=options.out / "demo.trials.jsonl", title="sealing")
         summary = results.summarise(rows)
         renderer = options.renderer if options.perception == "vision" else "none"
         results.write(options.out, "demo", summary, rows, renderer=renderer, regime="static")

@@ -260,6 +260,32 @@ def plot_on_part(path: Path, title: str, surface: Surface, run: Recorder) -> Non
     plt.close(figure)
 
 
+def draw_frames(path: Path, title: str, run: Recorder, shown: Sequence[int], captions: Sequence[str]) -> None:
+    """Pictures of a run side by side, as Zhou et al., Fig. 15.
+
+    Args:
+        path: The PNG file.
+        title: Above them.
+        run: A run recorded with pictures.
+        shown: Indices of frames; of each the picture taken last before it.
+        captions: One a frame.
+    """
+    across = min(3, len(shown))
+    down = -(-len(shown) // across)
+    figure, grid = plt.subplots(
+        down, across, figsize=(5.6 * across, 4.2 * down + 0.5), squeeze=False, constrained_layout=True
+    )
+    figure.suptitle(title, fontsize=13)
+    for axes in grid.flat:
+        axes.axis("off")
+    for axes, k, caption in zip(grid.flat, shown, captions, strict=False):
+        last = k == len(run.time_s) - 1
+        axes.imshow(run.frames[-1 if last else k // SPEED_UP])
+        axes.set_title(caption, fontsize=9)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureTrace:
     """The features of a run of T frames beside the truth; two columns are front and side view.

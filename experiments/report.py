@@ -55,6 +55,11 @@ ABOUT = {
         "Obstacle",
         "A body crosses the path: with an obstacle leaf added at run time, and without.",
     ),
+    "reactive": (
+        "What makes moving parts sealable",
+        "Reactive control",
+        "The dynamic regime with parts of the reactive control switched off, one at a time.",
+    ),
     "fig12": (
         "Fig. 12: edge methods on single frames",
         "Fig. 12",
@@ -81,7 +86,18 @@ ABOUT = {
         "How the settings of each edge method were chosen, on validation seeds.",
     ),
 }
-_FIRST = ("table3", "table4", "severity", "obstacle", "demo", "table2", "fig12", "fig15", "learning_curves")
+_FIRST = (
+    "table3",
+    "table4",
+    "severity",
+    "obstacle",
+    "reactive",
+    "demo",
+    "table2",
+    "fig12",
+    "fig15",
+    "learning_curves",
+)
 
 
 class File(NamedTuple):

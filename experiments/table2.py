@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agents import engines
 from experiments import command, results, trials
 from experiments.table2_report import FEATURES, REGIONS, Method, markdown, plot, summarise
 from seal_gym.core.cell import load_cell
@@ -388,7 +389,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         rows = trials.run_all(
             wanted,
-            jobs=options.jobs,
+            engine=engines.local(options.jobs),
             log=options.out / "table2.trials.jsonl",
             title="filming",
             work=partial(run, frames=frames),

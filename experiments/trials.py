@@ -2,8 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from tqdm import tqdm
 
 import agents
 import seal_gym
-from agents.processes import pool
+from agents.engines import Engine
 from agents.provenance import ROOT
 from agents.rollouts import play_once
 from experiments import results, shapes
@@ -38,13 +37,20 @@ _SIMULATIONS = 5  # at once: a divisor of TOGETHER, so that none idles; more sav
 _PATH_EVERY = 3  # frames, about 1 mm of the seam
 # They say which trials to run, or turn their rows into tables and pictures: no row depends on them.
 _NO_ROW_DEPENDS_ON = (
+    "command.py",
+    "control_figures.py",
+    "control_report.py",
+    "control_table.py",
     "demo.py",
     "learning_curves.py",
+    "methods.py",
     "pictures.py",
     "results.py",
+    "severity.py",
+    "severity_figures.py",
+    "severity_report.py",
     "table3.py",
-    "table3_figures.py",
-    "table3_report.py",
+    "table4.py",
 )
 _SOURCES = (".py", ".xml", ".toml")
 
@@ -358,7 +364,7 @@ def run_together(batch: Sequence[Trial]) -> list[Row]:
 def run_all(
     trials: Iterable[Trial],
     *,
-    jobs: int,
+    engine: Engine,
     log: Path,
     title: str,
     work: Worker | None = None,
@@ -368,7 +374,7 @@ def run_all(
 
     Args:
         trials: What to run.
-        jobs: Processes.
+        engine: Where they run.
         log: A file of JSON lines; what is in it with the same specification, from the same code, weights
             and packages, is not run again.
         title: Of the progress bar.
@@ -388,7 +394,7 @@ def run_all(
         log.open("a", encoding="utf-8") as file,
         tqdm(total=len(wanted), initial=len(wanted) - len(missing), desc=title, unit="trial") as bar,
     ):
-        for batch, rows in _results(batches, jobs, work_all):
+        for batch, rows in engine(work_all, batches):
             for trial, row in zip(batch, rows, strict=True):
                 done[_key(trial)] = row
                 file.write(json.dumps({"code": _code(trial), **row}) + "\n")
@@ -408,19 +414,6 @@ def _batches(trials: Sequence[Trial], size: int) -> list[list[Trial]]:
 
 def _one_by_one(work: Worker, batch: Sequence[Trial]) -> list[Row]:
     return [work(trial) for trial in batch]
-
-
-def _results(
-    batches: list[list[Trial]], jobs: int, work: Callable[[Sequence[Trial]], list[Row]]
-) -> Iterator[tuple[list[Trial], list[Row]]]:
-    if jobs <= 1 or len(batches) <= 1:
-        for batch in batches:
-            yield batch, work(batch)
-        return
-    with pool(min(jobs, len(batches))) as workers:
-        running = {workers.submit(work, batch): batch for batch in batches}
-        for future in as_completed(running):
-            yield running[future], future.result()
 
 
 def _code(trial: Trial) -> str:

@@ -154,7 +154,8 @@ class RmpAdapter:
         """
         policy = TipRmp(action[:, :6] * self._scale, cholesky_metric(CHOLESKY_SCALE * action[:, 6:]))
         # Blind, the gun comes to rest.
-        reference = reference_twist(np.where(state.seen, self._speed, 0.0), state.seam_twist)
+        speed = np.where(state.seen, self._speed, 0.0)
+        reference = reference_twist(speed, state.seam_twist, self._sealing)
         fixed = fixed_policies(state.errors, state.tip.twist, reference, state.tip_accel, self._sealing)
         return {"policy": policy, **dict(zip(FIXED_POLICIES, fixed, strict=True))}
 
@@ -216,13 +217,16 @@ class JointAdapter:
         return action * self._scale
 
 
-def make_adapter(control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...]) -> Adapter:
+def make_adapter(
+    control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...], sealing: SealingCfg | None = None
+) -> Adapter:
     """The adapter of a control mode.
 
     Args:
         control: ``"tip"``, ``"rmp"`` or ``"joint"``.
         cell: The cell.
         leaves: The user's leaves, for ``"rmp"``.
+        sealing: Configuration of the fixed leaves, for ``"rmp"``.
 
     Returns:
         The adapter.
@@ -237,7 +241,7 @@ def make_adapter(control: str, cell: CellCfg, leaves: tuple[LeafFunction, ...]) 
     if control == "tip":
         return TipAdapter(cell)
     if control == "rmp":
-        return RmpAdapter(cell, leaves)
+        return RmpAdapter(cell, leaves, sealing)
     if control == "joint":
         return JointAdapter(cell)
     raise ConfigError(f"control = {control!r}: must be one of {list(CONTROLS)}")

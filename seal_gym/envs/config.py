@@ -6,8 +6,10 @@ from typing import Any, Self
 import numpy as np
 
 from seal_gym.core.cell import CellCfg, load_cell
-from seal_gym.core.errors import ConfigError, require
+from seal_gym.core.errors import ConfigError, is_number, require
 from seal_gym.envs.adapters import CONTROLS, LeafFunction, check_leaf_function
+from seal_gym.estimation.seam_rate import SEAM_RATE_GAIN
+from seal_gym.rmp import SealingCfg
 from seal_gym.sim.look import LookCfg
 from seal_gym.tasks.progress import SealTaskCfg
 from seal_gym.tasks.reward import RewardCfg
@@ -64,6 +66,9 @@ class SealCfg:
         task: Outcomes and displacements.
         reward: Weights of the reward.
         vision: Parameters of edge stage, line stage and tracker.
+        seam_rate_gain: Share of a new difference in the estimate of the seam's motion, which policies and
+            fixed leaves feed forward; 0 switches that off.
+        sealing: Configuration of the fixed leaves, with ``control="rmp"``.
         look: Ranges of light, exposure, texture, blur and noise of the sensor images.
         cell: Calibration.
         threads: Threads for physics, images and vision of a vector of environments.
@@ -80,6 +85,8 @@ class SealCfg:
     task: SealTaskCfg = field(default_factory=SealTaskCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
     vision: PerceptionCfg = field(default_factory=PerceptionCfg)
+    seam_rate_gain: float = SEAM_RATE_GAIN
+    sealing: SealingCfg = field(default_factory=SealingCfg)
     look: LookCfg = field(default_factory=LookCfg)
     cell: CellCfg = field(default_factory=load_cell)
     threads: int = 1
@@ -91,6 +98,7 @@ class SealCfg:
             "task": SealTaskCfg,
             "reward": RewardCfg,
             "vision": PerceptionCfg,
+            "sealing": SealingCfg,
             "look": LookCfg,
             "cell": CellCfg,
         }
@@ -113,6 +121,10 @@ class SealCfg:
             "them out",
         )
         _whole("threads", self.threads, 1, 256)
+        require(
+            is_number(self.seam_rate_gain) and 0.0 <= self.seam_rate_gain <= 1.0,
+            f"seam_rate_gain = {self.seam_rate_gain!r}: must be a number in 0..1",
+        )
         object.__setattr__(self, "disturbances", disturbances(self.disturbances))
         object.__setattr__(self, "leaves", tuple(self.leaves))
 

@@ -118,13 +118,13 @@ class SealCore:
         self._reach = check_reach(free, task.part_shift_m, task.part_yaw_rad, by_vision=by_vision)
         self._seam = self.scene.workpiece.seam
         self.arm = ArmBatch(self.scene, n, cfg.threads)
-        self.adapter = make_adapter(cfg.control, cell, cfg.leaves)
+        self.adapter = make_adapter(cfg.control, cell, cfg.leaves, cfg.sealing)
         self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
         self.sensors = Sensors(self.scene, cfg, n)
         self._disturbances = Disturbances(cfg.disturbances, n, self.adapter.size, self.scene)
         self._views = ViewGeometry.of(cell)
         self._images: Images | None = None
-        self._rate = SeamRate(n, cell.timing.frame_s)
+        self._rate = SeamRate(n, cell.timing.frame_s, cfg.seam_rate_gain)
         self.features = RoiFeatures.zeros(n)
         self.lines = SeamLines(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2), np.bool_))
         self.tip: TipKinematics = tip_kinematics(self.arm.q, self.arm.qd)

@@ -11,6 +11,15 @@ back, sums them and solves for joint accelerations::
 from seal_gym.rmp.algebra import Leaf, Rmp, combine, gather, pullback
 from seal_gym.rmp.barriers import BarrierCfg, JointLimitCfg, ObstacleCfg, joint_limits, obstacle
 from seal_gym.rmp.cholesky import cholesky_metric, metric_size, metric_to_cholesky
+from seal_gym.rmp.clearance import (
+    SEALING_GUN,
+    Capsules,
+    Clearances,
+    LetPassCfg,
+    allowed_speed,
+    clearances,
+    let_pass,
+)
 from seal_gym.rmp.leaves import (
     AttractionCfg,
     DampingCfg,
@@ -37,6 +46,7 @@ from seal_gym.rmp.resolve import ResolveCfg, damping_squared, resolve
 from seal_gym.rmp.sealing import (
     SealingCfg,
     SeamErrors,
+    TravelCfg,
     axis_errors,
     fixed_policies,
     reference_twist,
@@ -44,14 +54,18 @@ from seal_gym.rmp.sealing import (
 )
 
 __all__ = [
+    "SEALING_GUN",
     "AttractionCfg",
     "BarrierCfg",
+    "Capsules",
+    "Clearances",
     "DampingCfg",
     "ForwardSpeedCfg",
     "HeadingCfg",
     "JointLimitCfg",
     "Leaf",
     "LeanCfg",
+    "LetPassCfg",
     "ObstacleCfg",
     "RegularisationCfg",
     "ResolveCfg",
@@ -60,11 +74,14 @@ __all__ = [
     "SeamErrors",
     "ServoCfg",
     "TipRmp",
+    "TravelCfg",
+    "allowed_speed",
     "attraction_front",
     "attraction_side",
     "axis_errors",
     "blend",
     "cholesky_metric",
+    "clearances",
     "combine",
     "damping",
     "damping_squared",
@@ -75,6 +92,7 @@ __all__ = [
     "heading_side",
     "joint_limits",
     "lean",
+    "let_pass",
     "metric_size",
     "metric_to_cholesky",
     "obstacle",

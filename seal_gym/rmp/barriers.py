@@ -64,8 +64,8 @@ def joint_limits(q: Array, qd: Array, lower: Array, upper: Array, cfg: JointLimi
     Returns:
         Pushes inward and damps outward velocity near a limit; the diagonal metric is 0 away from limits.
     """
-    accel_low, weight_low = _barrier(q - lower, qd, cfg)
-    accel_high, weight_high = _barrier(upper - q, -qd, cfg)
+    accel_low, weight_low = barrier(q - lower, qd, cfg)
+    accel_high, weight_high = barrier(upper - q, -qd, cfg)
     weight = weight_low + weight_high
     accel = (weight_low * accel_low - weight_high * accel_high) / np.where(weight > 0.0, weight, 1.0)
     unit = identity(q.shape[-1])
@@ -88,7 +88,7 @@ def obstacle(
     Returns:
         A leaf on a one-dimensional task: Jacobian (..., 1, n), metric (..., 1, 1).
     """
-    accel, weight = _barrier(distance, rate, cfg)
+    accel, weight = barrier(distance, rate, cfg)
     return Leaf(
         jacobian=gradient[..., None, :],
         drift=drift[..., None],
@@ -97,8 +97,17 @@ def obstacle(
     )
 
 
-def _barrier(distance: Array, rate: Array, cfg: BarrierCfg) -> tuple[Array, Array]:
-    """Acceleration away from zero distance, and its weight."""
+def barrier(distance: Array, rate: Array, cfg: BarrierCfg) -> tuple[Array, Array]:
+    """Acceleration away from zero distance, and its weight.
+
+    Args:
+        distance: [m] or [rad]. Shape (...).
+        rate: Its time derivative [m/s] or [rad/s]. Shape (...).
+        cfg: Margin and gains.
+
+    Returns:
+        Acceleration and metric, the latter zero beyond the margin. Shape (...) each.
+    """
     depth = np.maximum(1.0 - distance / cfg.margin, 0.0)
     spring = cfg.omega_n**2 * cfg.margin * depth
     accel = spring - 2.0 * cfg.zeta * cfg.omega_n * np.minimum(rate, 0.0)

@@ -11,6 +11,7 @@ import numpy as np
 
 from seal_gym.core.errors import require
 from seal_gym.rmp.algebra import Array
+from seal_gym.rmp.checks import require_positive
 from seal_gym.rmp.leaves import (
     ABOUT_X,
     ABOUT_Y,
@@ -53,8 +54,28 @@ class SeamErrors(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TravelCfg:
+    """Travel slows down where the seam turns faster under the tip than the gun follows well.
+
+    A part that comes towards the gun doubles the rate at which it takes a corner; neither view shows that
+    motion on a straight seam, but the turning shows it in the corner.
+
+    Attributes:
+        turn_rad_s: Rate up to which the gun travels at full speed [rad/s].
+        slope: Share of the speed that is lost between that rate and twice that rate; the rest stops at 0.
+    """
+
+    turn_rad_s: float = 1.6
+    slope: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        require_positive(self, "turn_rad_s", "slope")
+
+
+@dataclass(frozen=True, kw_only=True)
 class SealingCfg:
-    """The configurations of the eight leaves, made for each other."""
+    """The configurations of the eight leaves and of the travel, made for each other."""
 
     attraction: AttractionCfg = field(default_factory=AttractionCfg)
     heading: HeadingCfg = field(default_factory=HeadingCfg)
@@ -62,6 +83,7 @@ class SealingCfg:
     damping: DampingCfg = field(default_factory=DampingCfg)
     regularisation: RegularisationCfg = field(default_factory=RegularisationCfg)
     lean: LeanCfg = field(default_factory=LeanCfg)
+    travel: TravelCfg = field(default_factory=TravelCfg)
 
     @classmethod
     def tuned(cls, omega_n: float, zeta: float = 0.7) -> Self:
@@ -97,19 +119,22 @@ class SealingCfg:
 DEFAULT_SEALING = SealingCfg()
 
 
-def reference_twist(v_ref: Array | float, seam_twist: Array) -> Array:
-    """Twist to damp against: v_ref along y plus the seam's own twist.
+def reference_twist(v_ref: Array | float, seam_twist: Array, cfg: SealingCfg = DEFAULT_SEALING) -> Array:
+    """Twist to damp against: travel along y plus the seam's own twist.
 
     Args:
-        v_ref: Speed along the seam [m/s]. Scalar or shape (...).
-        seam_twist: Twist of the workpiece at the tip, in the tip frame; zeros if it stands still.
+        v_ref: Speed along the seam where it turns slowly [m/s]. Scalar or shape (...).
+        seam_twist: Twist of the seam at the tip, in the tip frame; zeros if it is straight and stands still.
             Shape (..., 6).
+        cfg: How travel slows down in turns.
 
     Returns:
         Shape (..., 6).
     """
+    turn = np.hypot(seam_twist[..., ABOUT_X], seam_twist[..., ABOUT_Z])
+    share = 1.0 - cfg.travel.slope * (turn / cfg.travel.turn_rad_s - 1.0)
     reference = seam_twist.copy()
-    reference[..., Y] += v_ref
+    reference[..., Y] += v_ref * np.minimum(np.maximum(share, 0.0), 1.0)
     return reference
 
 

@@ -360,7 +360,8 @@ def _perceive(
             valid[i, 0] = valid[i, 1] = False
             continue
         for a in range(3):
-            state.point[i, a], state.direction[i, a] = tip[a, 3], 0.0
+            state.tip[i, a] = state.point[i, a] = tip[a, 3]
+            state.direction[i, a] = 0.0
             for b in range(3):
                 state.point[i, a] += tip[a, b] * p[b]
                 state.direction[i, a] += tip[a, b] * d[b]
@@ -420,6 +421,9 @@ class Perception:
             point=np.zeros((n, 3)),
             direction=np.zeros((n, 3)),
             variance=np.zeros((n, 2)),
+            tip=np.zeros((n, 3)),
+            gone=np.zeros(n),
+            carried=np.zeros((n, 3)),
             tracking=np.zeros(n, np.bool_),
             missed=np.zeros((n, 2), np.int64),
             clock=np.zeros(n, np.int64),
@@ -432,6 +436,7 @@ class Perception:
             weight=np.zeros((n, rays)),
             stamp=np.full((n, rays), -1, np.int64),
             head=np.zeros(n, np.int64),
+            page=np.zeros(n, np.int64),
         )
         # One work space for each thread that ever drew on it.
         self._rooms = [Scratch.of(length, width, self._edges.pad, rays)]

@@ -48,6 +48,7 @@ class PerceptionCfg:
         gate: Measurements this many standard deviations off are not believed.
         follow_gain: Share of the new edges' drift against the memory by which the memory follows.
         velocity_gain: Share of that drift added to the part's velocity a frame.
+        along_gain: Share of the drift along the seam, which bends show, that both take.
     """
 
     edges: EdgeCfg = field(default_factory=EdgeCfg)
@@ -72,13 +73,14 @@ class PerceptionCfg:
     gate: float = 5.0
     follow_gain: float = 0.4
     velocity_gain: float = 0.1
+    along_gain: float = 1.0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         for name in ("coast_s", "search_s", "level_gain",
                      "memory_s", "ahead_px", "sigma_m", "bend", "step_m", "step_rad", "clip_m",
                      "jump_m", "row_sigma_m", "side_px", "height_q_m", "pitch_q_rad", "gate", "follow_gain",
-                     "velocity_gain"):  # fmt: skip
+                     "velocity_gain", "along_gain"):  # fmt: skip
             value = getattr(self, name)
             require(0.0 < value < np.inf, f"PerceptionCfg.{name} = {value!r}: must be finite and > 0")
         for name in ("level_change", "level_step"):
@@ -112,6 +114,7 @@ class TrackNumbers(NamedTuple):
     level_gain: float
     follow_gain: float
     velocity_gain: float
+    along_gain: float
     plate: tuple[float, float, float]
     groove: tuple[float, float, float]
 
@@ -153,9 +156,12 @@ class TrackState(NamedTuple):
     point: Array  # the tangent's point nearest the tip, world, (N, 3), m
     direction: Array  # its direction of travel, world, (N, 3)
     variance: Array  # of the plane's height and pitch, (N, 2)
+    tip: Array  # where the tip was in the frame before, world, (N, 3), m
+    gone: Array  # the tip's travel over the part since the last page, (N,), m
+    carried: Array  # the part's motion since then, world, (N, 3), m
     tracking: Bools  # (N,)
     missed: NDArray[np.int64]  # frames without the seam, (N, 2)
-    clock: NDArray[np.int64]  # frames in which the front view showed the seam, (N,)
+    clock: NDArray[np.int64]  # pages of the memory, one for each step of travel or motion, (N,)
     level: Array  # usual grey levels beside the line, views by sides, -1 before the first, (N, 2, 2)
     last: Array  # those of the frame before, -1 likewise
     steady: NDArray[np.int64]  # frames since they jumped, (N, 2)
@@ -163,8 +169,9 @@ class TrackState(NamedTuple):
     eye: Array  # remembered rays: optical centre, world, (N, K, 3), m
     ray: Array  # direction, (N, K, 3)
     weight: Array  # (N, K)
-    stamp: NDArray[np.int64]  # frame of each, -1 for none, (N, K)
+    stamp: NDArray[np.int64]  # page of each, -1 for none, (N, K)
     head: NDArray[np.int64]  # where the next ray goes, (N,)
+    page: NDArray[np.int64]  # where the last page begins, (N,)
 
 
 class EdgeMaps(NamedTuple):
@@ -236,6 +243,8 @@ class Scratch(NamedTuple):
 def forget(i: int, state: TrackState) -> None:
     """Gives one simulation's track up."""
     state.tracking[i] = False
+    state.clock[i] = 0
+    state.gone[i] = np.inf  # the first frame begins a page
     state.missed[i, 0] = state.missed[i, 1] = 0
     for a in range(3):
         state.velocity[i, a] = 0.0

@@ -8,7 +8,7 @@ from seal_gym.core.jit import kernel
 from seal_gym.vision.features import ViewGeometry
 from seal_gym.vision.groove import CUTS, SECTION, cuts_at, section_of
 from seal_gym.vision.seam_line import NARROW_PX, LineNumbers, follow, row_edge
-from seal_gym.vision.seam_memory import fit_memory, remember
+from seal_gym.vision.seam_memory import fit_memory, remember, travel, turn_page
 from seal_gym.vision.strip_geometry import normalise, plate_axes, strip_slope, to_strip
 from seal_gym.vision.track_state import MIN_ROWS, Scratch, TrackNumbers, TrackState
 
@@ -17,6 +17,7 @@ Bools = NDArray[np.bool_]
 _MM, _DEG = 1e-3, float(np.deg2rad(1.0))
 _SETTLED = 6  # frames without a jump after which new grey levels are the usual ones
 _BESIDE = 8  # pixels on either side of the line whose brightness is watched
+_BEND_GAIN, _TURNED = 0.06, 0.2  # how slopes follow the edge, and what change of slope is a bend
 # From above a plate the side view answers to a bend four times as much as in a fillet: its far rows are the
 # less sure, as the root, because a bend's error grows with the square of the way. And the bend is known to
 # about this share, which this far from the tip looks like a change of the plane's height and pitch.
@@ -46,12 +47,13 @@ def _usual(
     view: int,
     mask: Bools,
     line: Array,
+    followed: int,
     section: Array,
     par: TrackNumbers,
     state: TrackState,
     s: Scratch,
 ) -> bool:
-    """Whether plate and wall beside the expected line are as bright as they usually are.
+    """Whether plate and wall beside the followed edge, or else the expected line, are as bright as usual.
 
     A hand or a shadow that comes in changes them from one frame to the next; the wall beyond a corner changes
     them slowly. After a jump they have to be nearer to the usual ones; what stays for longer than the
@@ -65,13 +67,20 @@ def _usual(
     # In the side view the wall changes too much at corners; the height's gate guards it.
     for side in range(view, 2):
         total, count = 0.0, 0
+        o, slope, next_point = line[1] + line[2] * (int(line[0]) + 0.5 - line[0]), line[2], 0
         for row in range(max(int(line[0]), 0), min(int(line[0] + par.ahead_px), height)):
-            o = line[1] + line[2] * (row + 0.5 - line[0])
+            if next_point < followed and int(line[0] + s.points[next_point, 0]) == row:
+                error = s.points[next_point, 1] - o
+                o, slope = o + error, slope + _BEND_GAIN * error
+                next_point += 1
+            elif next_point >= followed and abs(slope - line[2]) > _TURNED:
+                break  # beyond a corner the plate is on both sides
             first = int(o + half) + 2 if side == 1 else int(o - half) - 1 - _BESIDE
             for x in range(max(first, 0), min(first + _BESIDE, width)):
                 if not mask[row, x]:
                     total += s.grey[row, x]
                     count += 1
+            o += slope
         level, last = state.level[i, view, side], state.last[i, view, side]
         fresh[side] = total / (3.0 * count) if count >= _BESIDE else last
         if level >= 0.0:
@@ -117,10 +126,10 @@ def track_front(
     Returns whether the front view showed the seam; without, the memory carries on.
     """
     line, n, m, section = np.empty(3), np.empty(3), np.empty(3), np.empty(SECTION)
+    travel(i, tip, d, state)
     plate_axes(d, par.plate, n, m)
     seen = strip_slope(p, d, 0, g, line) and abs(line[2]) <= 2.0
     seen = seen and section_of(p, d, n, m, 0, g, par.groove, section)
-    seen = seen and _usual(i, 0, mask, line, section, par, state, s)
     if seen:
         o = line[1] + line[2] * (ref[0] - line[0])
         count = follow(
@@ -137,9 +146,15 @@ def track_front(
             s.profile,
             s.points,
         )
-        seen = count >= MIN_ROWS
+        line[0] = ref[0]
+        line[1] = o
+        enough = count >= MIN_ROWS
+        ahead = 0
+        while ahead < count and s.points[ahead, 0] > 0.0:
+            ahead += 1
+        seen = _usual(i, 0, mask, line, ahead if enough else 0, section, par, state, s) and enough
         if seen:
-            state.clock[i] += 1
+            turn_page(i, state)
             remember(i, tip, count, ref, g, par, state, s)
     oldest = max(state.clock[i] - int(par.memory), 0)
     fitted = fit_memory(i, tip, p, d, n, m, oldest, par, state, s.fit, curve)
@@ -295,7 +310,7 @@ def track_side(
         return False
     if not section_of(p, d, n, m, 1, g, par.groove, section):
         return False
-    if not _usual(i, 1, mask, line, section, par, state, s):
+    if not _usual(i, 1, mask, line, 0, section, par, state, s):
         return False
     if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return False

@@ -1,4 +1,4 @@
-"""``MovingObstacle``: a fist reaches over the wall into the gun's way, stays, and withdraws."""
+"""``MovingObstacle``: a fist reaches down over the wall into the gun's way, stays, and withdraws."""
 
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
@@ -28,8 +28,8 @@ class MovingObstacleCfg(DisturbanceCfg):
     """A ball of the size of a fist that the gun must let pass: who drives on as planned touches it.
 
     It waits beyond the wall and sets out when the gun, by its progress along the seam, is so far from the
-    crossing that at nominal speed it would come there three seconds after the fist. It crosses the seam's
-    plane horizontally above the wall and stops where the gun's front camera would be. It collides with gun
+    crossing that at nominal speed it would come there three seconds after the fist. It comes down over the
+    wall at 45 degrees and stops where the gun's front camera would be. It collides with gun
     and arm, hides what it stands in front of, and its pose stands in ``info["obstacle"]`` and in
     ``ArmState.obstacle`` for leaves. Severity scales the time it stays.
 
@@ -103,13 +103,16 @@ class Fist:
         self._since[i] = np.inf
 
     def _rest(self, s: float) -> tuple[Array, Array]:
-        """Where the fist stays and the horizontal direction it comes in, in the part's frame."""
+        """Where the fist stays and the direction it comes in, in the part's frame.
+
+        From above: level with the wall it would withdraw to where a round seam leads the gun later.
+        """
         seam = self._seam.at(s)
         height = self._top + self.radius + _ABOVE_WALL_M
         above = max(height / max(seam.approach[2], 0.5), _LOWEST_M)
         end = seam.position + above * seam.approach + (_AHEAD_OF_CAMERA_M + self.radius) * seam.tangent
         way = seam.approach if np.hypot(*seam.approach[:2]) > 0.1 else np.cross(seam.tangent, seam.approach)
-        return end, normalise(way * [1.0, 1.0, 0.0])
+        return end, normalise(normalise(way * [1.0, 1.0, 0.0]) - [0.0, 0.0, 1.0])
 
     def watch(self, s: Array, t: Array) -> None:
         """Sets the obstacles off whose time has come.

@@ -236,9 +236,9 @@ def test_killed_and_started_again_with_two_jobs_it_ends_with_the_same_files(refe
 # -- the command ----------------------------------------------------------------------------------------
 
 
-def fake(units):
+def fake(work, units):
     for unit in units:
-        yield [episode(k, 5 + k) for k in unit.indices]
+        yield unit, [episode(k, 5 + k) for k in unit.indices]
 
 
 def gather(out, count, cfg=STILL, engine=fake, seed=0):
@@ -252,9 +252,9 @@ def test_a_damaged_shard_is_made_again(tmp_path):
     shard.write_bytes(shard.read_bytes()[:50])
     ran = []
 
-    def engine(units):
+    def engine(work, units):
         ran.extend(k for u in units for k in u.indices)
-        yield from fake(units)
+        yield from fake(work, units)
 
     gather(tmp_path / "a", 3, engine=engine)
     assert ran == [1]
@@ -271,8 +271,8 @@ def test_more_episodes_are_added_to_those_there_are(tmp_path):
 
 
 def test_a_stop_between_episodes_loses_none(tmp_path):
-    def stopped(units):
-        yield from fake(units[:2])
+    def stopped(work, units):
+        yield from fake(work, units[:2])
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -299,10 +299,10 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path, capsys):
 
 
 def test_two_collections_do_not_write_into_one_folder(tmp_path):
-    def second(units):
+    def second(work, units):
         with pytest.raises(ConfigError, match="another collection"):
             gather(tmp_path / "a", 2)
-        yield from fake(units)
+        yield from fake(work, units)
 
     gather(tmp_path / "a", 2, engine=second)
 
@@ -365,8 +365,8 @@ cluster.shutdown()
 
 
 def test_a_node_with_other_code_is_refused():
-    with pytest.raises(ConfigError, match=r"this node's code .* is not the collection's \(0123\)"):
-        remote.run_checked(Work(indices=(0,)), "0123")
+    with pytest.raises(ConfigError, match=r"this node's code .* is not the caller's \(0123\)"):
+        remote.run_checked(len, Work(indices=(0,)), collect.code_hash, "0123")
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from agents import policies, sb3_policies
 from agents.policies import LearnedPolicy, PolicyFileError
 from agents.sb3_policies import NetCfg
 from seal_gym.core.errors import ConfigError
+from seal_gym.envs import vector as vector_face
 from seal_gym.envs.sb3 import make_sb3_vec
 
 KINDS = ("neural_rmp", "neural_rmp_identity", "neural_control")
@@ -93,6 +94,42 @@ def test_it_acts_in_single_and_vectorised_environments(name, weights):
     np.testing.assert_array_equal(actions[0], action)
     vector.step(actions)
     vector.close()
+
+
+def test_a_policy_that_senses_is_mounted_in_its_environment():
+    single, vector = make(), make_sb3_vec("SealGym/Flat-v0", 2, control="tip", perception="oracle")
+    assert agents.control_of("adaptive") == "tip"
+    vector.seed(12)
+    observation = vector.reset()
+    actions, state = agents.load_policy("adaptive", vector).predict(observation, None, np.ones(2, np.bool_))
+    action, _ = agents.load_policy("adaptive", single).predict(single.reset(seed=12)[0])
+    np.testing.assert_array_equal(action, actions[0])
+    assert actions.shape == (2, 6)
+    assert len(state) == 2
+    assert single.action_space.contains(action)
+    # It goes by its own sensor: without the cameras' features (rows 0-9) it does the same.
+    dark = np.where(np.arange(35) < 10, 0.0, observation).astype(np.float32)
+    blindfold, _ = agents.load_policy("adaptive", vector).predict(dark)
+    np.testing.assert_array_equal(blindfold, actions)
+    vector.close()
+
+
+def test_a_policy_that_senses_is_mounted_in_gymnasiums_vector(monkeypatch):
+    if gym.__version__.startswith("0."):  # users are refused there, though the numbers are the same
+        monkeypatch.setattr(vector_face, "require_gymnasium_1", lambda: None)
+        monkeypatch.setattr(gym.vector.VectorEnv, "viewer", None, raising=False)
+    venv, single = vector_face.SealVectorEnv(2, control="tip", perception="oracle"), make()
+    actions, _ = agents.load_policy("adaptive", venv).predict(venv.reset(seed=12)[0])
+    action, _ = agents.load_policy("adaptive", single).predict(single.reset(seed=12)[0])
+    np.testing.assert_array_equal(actions[0], action)
+    venv.close()
+
+
+def test_a_policy_that_senses_needs_its_environment():
+    with pytest.raises(ConfigError, match=r"load_policy\('adaptive', env\)"):
+        agents.load_policy("adaptive")
+    with pytest.raises(ConfigError, match="acts with control='tip', the environment has 'rmp'"):
+        agents.load_policy("adaptive", make("rmp"))
 
 
 def test_weights_can_be_loaded_by_their_path(weights):

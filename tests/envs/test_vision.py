@@ -1,12 +1,17 @@
 """Environments that see by vision."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from agents.expert import RmpExpert
+from seal_gym.core.cell import load_cell
+from seal_gym.envs.adapters import make_adapter
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import SealCore
+from seal_gym.wrappers import dynamic_regime
 
 
 def roll(n, seeds, frames=25, observation="features"):
@@ -55,6 +60,43 @@ def test_the_oracle_without_images_measures_no_noise():
     env = gym.make("SealGym/Flat-v0", perception="oracle")
     assert "snr_db" not in env.reset(seed=0)[1]
     env.close()
+
+
+@pytest.mark.parametrize("part", ["flat", "cylinder", "rectangular"])
+def test_a_gun_that_waits_stays_on_the_seam(part):
+    """For 8 s, without travel to show it the seam behind the tip; it once swayed by 14 deg."""
+    cell = load_cell()
+    core = SealCore(SealCfg.of(workpiece=part, control="rmp", perception="vision"), 4)
+    for i in range(4):
+        core.reset(i, np.random.default_rng(500_008 + i))
+    still = replace(cell, process=replace(cell.process, speed_m_s=1e-4))
+    expert, waiting, errors, turning = RmpExpert(cell), RmpExpert(still), [], []
+    for k in range(400):
+        core.step((expert if k < 150 else waiting).predict(core.observe())[0])
+        if k == 150:
+            core.adapter = make_adapter("rmp", still, ())
+        if k >= 170:
+            errors.append(1e3 * core.progress.error_m)
+            turning.append(np.degrees(core.tip.twist[:, 3:]))
+    assert np.max(errors) < 0.2
+    assert np.abs(turning).max() < 20.0
+
+
+def test_a_start_in_odd_light_finds_the_seams_direction():
+    """The first frames show edges ahead of the tip alone: heading and bend once traded places here."""
+    core = SealCore(
+        SealCfg.of(
+            workpiece="cylinder", control="rmp", perception="vision", disturbances=dynamic_regime(1.0)
+        ),
+        1,
+    )
+    core.reset(0, np.random.default_rng(530_058))
+    expert, thetas = RmpExpert(), []
+    for _ in range(12):
+        core.step(expert.predict(core.observe())[0])
+        thetas.append(np.degrees(core.features.theta_rad[0]))
+    assert np.abs(thetas).max() < 15.0  # 28 deg, and a collision
+    assert np.abs(thetas[-1]).max() < 3.0
 
 
 class Curtain:

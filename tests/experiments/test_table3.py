@@ -15,7 +15,7 @@ import pytest
 import agents
 from agents.policies import LearnedPolicy, save
 from agents.provenance import commit
-from experiments import results, table3, table3_figures, table3_report, trials
+from experiments import control_figures, control_report, control_table, methods, results, table3, trials
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = ("neural_control", "neural_rmp")
@@ -64,7 +64,7 @@ def weights(folder, seeds=(0, 1), shipped=1, kinds=KINDS):
     ],
 )
 def test_mcnemars_test_is_the_sign_test_by_hand(first, second, p):
-    assert table3_report.mcnemar(first, second) == pytest.approx(p, rel=1e-12)
+    assert control_report.mcnemar(first, second) == pytest.approx(p, rel=1e-12)
 
 
 def test_paired_differences_by_hand():
@@ -80,7 +80,7 @@ def test_paired_differences_by_hand():
         trial("pid_servo", 1, rmse=0.25),
         trial("pid_servo", 0, rmse=0.19),
     ]
-    (row,) = table3_report.paired([*mine, *base])
+    (row,) = control_report.paired([*mine, *base])
     assert (row["method"], row["against"], row["workpiece"]) == ("pid_servo", "neural_rmp", "flat")
     assert row["pairs"] == 4
     assert (row["only_method"], row["only_against"], row["both_reached"]) == (1, 1, 2)
@@ -97,16 +97,16 @@ def test_the_interval_of_a_paired_difference_uses_the_pairing():
     gap = 0.05 + rng.normal(0.0, 0.01, 200)
     rows = [trial("neural_rmp", k, rmse=v) for k, v in enumerate(hard)]
     rows += [trial("neural_control", k, rmse=v + g) for k, (v, g) in enumerate(zip(hard, gap, strict=True))]
-    (row,) = table3_report.paired(rows)
+    (row,) = control_report.paired(rows)
     low, high = row["rmse_diff_mm_ci"]
     half = 1.96 * gap.std() / np.sqrt(200)
     assert (low, high) == pytest.approx((gap.mean() - half, gap.mean() + half), abs=5e-4)
 
 
 def test_a_pair_needs_both_methods_and_the_same_seeds():
-    assert table3_report.paired([trial("pid_servo", 0)]) == []
+    assert control_report.paired([trial("pid_servo", 0)]) == []
     with pytest.raises(results_error(), match="differ in seeds on flat"):
-        table3_report.paired([trial("neural_rmp", 0), trial("pid_servo", 1)])
+        control_report.paired([trial("neural_rmp", 0), trial("pid_servo", 1)])
 
 
 def results_error():
@@ -123,9 +123,9 @@ def test_spread_between_training_seeds_by_hand():
         for k in (0, 1)
     ]
     main = [t for t in seeds if t["training_seed"] == 1]
-    rows = table3_report.summarise(main, seeds, [])
-    assert [r["training_seed"] for r in table3_report.of_table(rows, "training_seeds")] == [0, 1, 2]
-    (line,) = table3_report.spread(rows)
+    rows = control_report.summarise(main, seeds, [])
+    assert [r["training_seed"] for r in control_report.of_table(rows, "training_seeds")] == [0, 1, 2]
+    (line,) = control_report.spread(rows)
     assert (line["shipped"], line["training_seeds"]) == (1, [0, 1, 2])
     assert (line["rmse_mm"], line["rmse_mm_min"], line["rmse_mm_max"]) == pytest.approx((0.2, 0.1, 0.6))
     assert line["rmse_mm_sd"] == pytest.approx(np.sqrt((0.2**2 + 0.1**2 + 0.3**2) / 2))
@@ -137,7 +137,8 @@ def test_spread_between_training_seeds_by_hand():
 
 
 def plan(tmp_path, *arguments):
-    return table3.plan(table3.parse(["--weights", str(weights(tmp_path / "w")), *arguments]))
+    options = control_table.parse(table3.TABLE, ["--weights", str(weights(tmp_path / "w")), *arguments])
+    return control_table.plan(table3.TABLE, options)
 
 
 def test_the_shipped_seed_runs_once_and_has_rows_in_both_tables(tmp_path):
@@ -191,13 +192,13 @@ def test_shipped_weights_that_are_not_their_seeds_are_refused(tmp_path):
     folder = weights(tmp_path / "w", kinds=("neural_rmp",))
     save(LearnedPolicy.fresh("neural_rmp", 7), folder / "neural_rmp.safetensors", {"seed": 1})
     with pytest.raises(results_error(), match="both of training seed 1, but differ"):
-        table3.find_weights(folder, "neural_rmp", (0, 1))
+        methods.find_weights(folder, "neural_rmp", (0, 1))
 
 
 def test_of_dagger_one_seed_is_enough(tmp_path):
     policy = LearnedPolicy.fresh("neural_rmp", 4)
     save(policy, tmp_path / "neural_rmp_dagger.safetensors", {"seed": 4})
-    found, missing = table3.find_weights(tmp_path, "neural_rmp_dagger", (0, 1, 2))
+    found, missing = methods.find_weights(tmp_path, "neural_rmp_dagger", (0, 1, 2))
     assert missing == []
     assert [w.training_seed for w in found] == [4]
 
@@ -205,7 +206,7 @@ def test_of_dagger_one_seed_is_enough(tmp_path):
 @pytest.mark.parametrize("text", ["--trials 0", "--shape-trials 0", "--jobs 0", "--seed -1"])
 def test_bad_counts_are_refused(text, capsys):
     with pytest.raises(SystemExit):
-        table3.parse(text.split())
+        control_table.parse(table3.TABLE, text.split())
     assert "must be at least" in capsys.readouterr().err
 
 
@@ -283,12 +284,12 @@ def test_the_files_hold_what_the_protocol_names(tmp_path):
         "trials",
     } <= set(document)
     assert (document["renderer"], document["regime"]) == ("none", "static")
-    main = table3_report.of_table(document["rows"], "main")
+    main = control_report.of_table(document["rows"], "main")
     assert [(r["method"], r["workpiece"], r["training_seed"]) for r in main] == [
         ("rmp_expert", "cylinder", None),
         ("neural_rmp", "cylinder", 1),
     ]
-    seeds = table3_report.of_table(document["rows"], "training_seeds")
+    seeds = control_report.of_table(document["rows"], "training_seeds")
     assert [r["training_seed"] for r in seeds] == [0, 1]
     assert {k: v for k, v in seeds[1].items() if k != "table"} == {
         k: v for k, v in main[1].items() if k != "table"
@@ -353,7 +354,7 @@ def test_kept_paths_end_where_the_trials_did(tmp_path):
 def test_distance_along_a_path_by_hand():
     desired = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0]])
     arc = np.array([0.0, 10.0, 20.0])
-    s, off = table3_figures.along_path(np.array([[3.0, 4.0, 0], [10, 6, 2], [12, -1, 0]]), desired, arc)
+    s, off = control_figures.along_path(np.array([[3.0, 4.0, 0], [10, 6, 2], [12, -1, 0]]), desired, arc)
     np.testing.assert_allclose(s, [3.0, 16.0, 10.0])
     np.testing.assert_allclose(off, [4.0, 2.0, np.sqrt(5)])
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import agents
+from agents import engines
 from agents.expert import RmpExpert
 from agents.policies import LearnedPolicy, save
 from experiments import shapes, trials
@@ -45,7 +46,7 @@ def test_trials_resume_and_do_not_depend_on_the_number_of_jobs(tmp_path):
     seam = write_seam(tmp_path / "short.csv")
     wanted = [trials.Trial(method="rmp_expert", workpiece=seam, seed=s, env=SHORT) for s in (5, 6, 7)]
     log = tmp_path / "log.jsonl"
-    rows = trials.run_all(wanted, jobs=1, log=log, title="t")
+    rows = trials.run_all(wanted, engine=engines.local(1), log=log, title="t")
     assert [r["outcome"] for r in rows] == ["reached"] * 3
     assert [r["seed"] for r in rows] == [5, 6, 7]
 
@@ -54,22 +55,22 @@ def test_trials_resume_and_do_not_depend_on_the_number_of_jobs(tmp_path):
     marked = json.loads(lines[0])
     marked["rmse_mm"] = 123.0
     log.write_text("\n".join([json.dumps(marked), lines[1], lines[2][:40]]) + "\n")
-    again = trials.run_all(wanted, jobs=2, log=log, title="t")
+    again = trials.run_all(wanted, engine=engines.local(2), log=log, title="t")
     assert again[0]["rmse_mm"] == 123.0
     assert again[1:] == rows[1:]
 
-    fresh = trials.run_all(wanted, jobs=2, log=tmp_path / "other.jsonl", title="t")
+    fresh = trials.run_all(wanted, engine=engines.local(2), log=tmp_path / "other.jsonl", title="t")
     assert fresh == rows
 
 
 def test_rows_of_other_code_are_run_again(tmp_path):
     wanted = [trials.Trial(method="rmp_expert", workpiece=write_seam(tmp_path / "s.csv"), seed=1, env=SHORT)]
     log = tmp_path / "log.jsonl"
-    (row,) = trials.run_all(wanted, jobs=1, log=log, title="t")
+    (row,) = trials.run_all(wanted, engine=engines.local(1), log=log, title="t")
     stale = json.loads(log.read_text())
     stale["rmse_mm"], stale["code"] = 77.0, "another"
     log.write_text(json.dumps(stale) + "\n")
-    assert trials.run_all(wanted, jobs=1, log=log, title="t") == [row]
+    assert trials.run_all(wanted, engine=engines.local(1), log=log, title="t") == [row]
 
 
 @pytest.mark.parametrize("first", ["nan,0,0,0,-0.7071,0.7071", "0.O,0,0,0,-0.7071,0.7071"])
@@ -156,10 +157,10 @@ def test_new_weights_are_run_anew(tmp_path):
     )
     expert = trials.Trial(method="rmp_expert", workpiece=seam, seed=1, env=SHORT)
     log = tmp_path / "log.jsonl"
-    trials.run_all([learned, expert], jobs=1, log=log, title="t", together=2)
+    trials.run_all([learned, expert], engine=engines.local(1), log=log, title="t", together=2)
     lines = log.read_text().splitlines()
     save(LearnedPolicy.fresh("neural_rmp", 5), file, {"seed": 0})
-    trials.run_all([learned, expert], jobs=1, log=log, title="t", together=2)
+    trials.run_all([learned, expert], engine=engines.local(1), log=log, title="t", together=2)
     new = [json.loads(line)["method"] for line in log.read_text().splitlines()[len(lines) :]]
     assert new == ["neural_rmp"]
 

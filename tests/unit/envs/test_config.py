@@ -66,3 +66,10 @@ def test_adapter_errors():
 def test_joint_adapter_scales():
     out = JointAdapter(SealCfg().cell)(np.array([[0.5, -1, 0, 0, 0, 1.0]]), None)
     np.testing.assert_array_equal(out, [[7.5, -15, 0, 0, 0, 15]])
+
+
+@pytest.mark.parametrize("gain", [-0.1, 1.5, np.nan, "much", None])
+def test_seam_rate_gain(gain):
+    with pytest.raises(ConfigError, match=r"seam_rate_gain = .*0\.\.1"):
+        SealCfg(seam_rate_gain=gain)
+    assert SealCfg(seam_rate_gain=0).seam_rate_gain == 0

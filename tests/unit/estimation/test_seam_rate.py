@@ -106,7 +106,7 @@ def test_the_gain_is_a_share_of_the_new_difference():
 
 
 def test_an_unseen_line_lets_the_estimate_fade_and_no_difference_spans_the_gap():
-    rate = SeamRate(1, DT)
+    rate = SeamRate(1, DT, gain=0.5)
     y = np.array([[0.0, 1.0, 0.0]])
     for k in range(10):
         rate.update(np.array([[k * 1e-4, 0.0, 0.0]]), y, np.eye(4)[None], SEEN)

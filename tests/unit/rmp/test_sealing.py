@@ -150,10 +150,27 @@ def test_axis_errors_carry_the_signs_of_the_motion_that_removes_them():
 
 
 def test_reference_adds_the_seam_and_leaves_its_argument_alone():
-    seam = np.ones((2, 6))
+    seam = np.ones((2, 6))  # rad/s: slow enough for the full speed
     reference = reference_twist(np.array([0.1, 0.2]), seam)
     np.testing.assert_array_equal(reference[:, 1], [1.1, 1.2])
     np.testing.assert_array_equal(seam, np.ones((2, 6)))
+
+
+@pytest.mark.parametrize(("turn", "share"), [(0.0, 1.0), (1.6, 1.0), (2.0, 0.5), (2.4, 0.0), (9.0, 0.0)])
+@pytest.mark.parametrize("axis", [3, 5])
+def test_travel_slows_down_where_the_seam_turns_fast(turn, share, axis):
+    seam = np.zeros((1, 6))
+    seam[0, axis], seam[0, 1] = -turn, 0.003
+    np.testing.assert_allclose(reference_twist(0.01, seam)[0, 1], 0.003 + 0.01 * share, atol=1e-15)
+
+
+def test_travel_round_a_corner_of_5_mm_settles_where_rule_and_geometry_meet():
+    """The seam turns at v / r, and v = v_ref (1 - 2 (v / r / 1.6 - 1)): 8.6 mm/s instead of 10."""
+    speed, seam = 0.01, np.zeros((1, 6))
+    for _ in range(200):
+        seam[0, 5] += 0.2 * (speed / 0.005 - seam[0, 5])  # the rate is known a little late
+        speed = reference_twist(0.01, seam)[0, 1]
+    assert speed == pytest.approx(0.03 / 3.5, rel=1e-6)
 
 
 def test_a_batch_gives_the_bits_of_its_members():

@@ -1,4 +1,4 @@
-"""Table 3's rows: intervals, the spread between training seeds, paired differences; and its Markdown."""
+"""Rows of control tables: intervals, the spread of training seeds, paired differences; and their Markdown."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -7,19 +7,10 @@ import numpy as np
 from scipy import stats
 
 from experiments import results, shapes
+from experiments.methods import BASE, METHODS
 from seal_gym.core.errors import SealGymError, require
 
 Row = dict[str, Any]
-BASE = "neural_rmp"
-METHODS = {
-    "rmp_expert": "the teacher: RMPs with gains set by hand",
-    "neural_rmp": "learned f and A, with the fixed leaves",
-    "neural_control": "direct control: the learned tip acceleration as given",
-    "neural_rmp_identity": "learned f and A = I, with the fixed leaves",
-    "neural_rmp_dagger": "neural_rmp after DAgger",
-    "neural_control_dagger": "neural_control after DAgger",
-    "pid_servo": "a PID visual servo on the same features",
-}
 
 
 def summarise(main: Sequence[Row], seeds: Sequence[Row], other: Sequence[Row]) -> list[Row]:
@@ -155,11 +146,12 @@ def paired(trials: Sequence[Row], base: str = BASE) -> list[Row]:
 
 
 def markdown(
-    rows: Sequence[Row], spreads: Sequence[Row], pairs: Sequence[Row], pictures: Sequence[str]
+    head: str, rows: Sequence[Row], spreads: Sequence[Row], pairs: Sequence[Row], pictures: Sequence[str]
 ) -> str:
     """The table for people.
 
     Args:
+        head: Its title and what it is about.
         rows: From ``summarise``.
         spreads: From ``spread``.
         pairs: From ``paired``.
@@ -169,7 +161,7 @@ def markdown(
         Markdown.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    parts = ["# Table 3: sealing parts that stand still"]
+    parts = [head]
     parts.append("\n".join(f"- `{m}`: {METHODS[m]}" for m in methods if m in METHODS))
     parts.append(
         "In brackets 95 % intervals over the trials: Wilson's for the rates, bootstrap for the others. RMSE "

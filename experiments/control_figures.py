@@ -1,4 +1,4 @@
-"""Table 3's figures: sampled paths against truth, distributions of the RMSE, generalisation."""
+"""Figures of control tables: sampled paths against truth, distributions of the RMSE, generalisation."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +22,8 @@ Row = dict[str, Any]
 Paths = Mapping[str, NDArray[np.float32]]
 CLEARANCE_MM = 1.06  # of the nozzle's mouth to wall and plate
 _BLUE, _GREY = "#1f5fa8", "#8a8f98"
-_COLOURS = {
+COLOURS = {
+    "adaptive": "#b8860b",
     "rmp_expert": "#6d7278",
     "neural_rmp": "#1f5fa8",
     "neural_control": "#d1382c",
@@ -31,8 +32,8 @@ _COLOURS = {
     "neural_control_dagger": "#e8883a",
     "pid_servo": "#8e5bb5",
 }
-_OTHER_COLOUR = "#444444"
-_plain = mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}")
+OTHER_COLOUR = "#444444"
+plain = mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}")
 _OUTCOMES = {
     "reached": ("o", "#2a9d54", "reached the end"),
     "collision": ("X", "#111111", "collision"),
@@ -53,20 +54,21 @@ def path_name(row: Row) -> str:
     return f"{row['method']}/{row['workpiece']}/{row['seed']}"
 
 
-def names(rows: Iterable[Row]) -> list[str]:
+def names(name: str, rows: Iterable[Row]) -> list[str]:
     """The files that ``draw`` writes.
 
     Args:
+        name: Of the table.
         rows: Of the table.
 
     Returns:
         Names.
     """
     cells = [(row["table"], row["workpiece"]) for row in rows]
-    out = [f"table3_paths_{part}.png" for part in dict.fromkeys(p for table, p in cells if table == "main")]
+    out = [f"{name}_paths_{part}.png" for part in dict.fromkeys(p for table, p in cells if table == "main")]
     tables = {table for table, _ in cells}
-    out += ["table3_rmse.png"] if "main" in tables else []
-    return out + (["table3_generalisation.png"] if "generalisation" in tables else [])
+    out += [f"{name}_rmse.png"] if "main" in tables else []
+    return out + ([f"{name}_generalisation.png"] if "generalisation" in tables else [])
 
 
 def draw(out: Path, document: Mapping[str, Any], paths: Paths) -> None:
@@ -74,7 +76,7 @@ def draw(out: Path, document: Mapping[str, Any], paths: Paths) -> None:
 
     Args:
         out: The folder.
-        document: With the table's ``rows`` and ``trials``.
+        document: With the table's ``name``, ``rows`` and ``trials``.
         paths: By ``path_name``, shape (samples, 3), mm.
     """
     rows, trials = document["rows"], document["trials"]
@@ -84,13 +86,14 @@ def draw(out: Path, document: Mapping[str, Any], paths: Paths) -> None:
             # Paths are the shipped training seed's, whose trials stand before those of the others.
             by_path.setdefault(path_name(t), t)
     main, other = ([row for row in rows if row["table"] == name] for name in ("main", "generalisation"))
-    for name in names(rows):
-        if name == "table3_rmse.png":
+    table = document["name"]
+    for name in names(table, rows):
+        if name == f"{table}_rmse.png":
             draw_rmse(out / name, main, trials)
-        elif name == "table3_generalisation.png":
+        elif name == f"{table}_generalisation.png":
             draw_generalisation(out / name, other, by_path, paths)
         else:
-            draw_paths(out / name, name.removeprefix("table3_paths_").removesuffix(".png"), by_path, paths)
+            draw_paths(out / name, name.removeprefix(f"{table}_paths_").removesuffix(".png"), by_path, paths)
 
 
 def desired_path(part: str) -> tuple[Array, Array, float]:
@@ -166,7 +169,7 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
         for name, trial in mine.items():
             tip = np.asarray(paths[name], dtype=np.float64)
             s, distance = along_path(tip, desired, arc)
-            colour = _COLOURS.get(method, _OTHER_COLOUR)
+            colour = COLOURS.get(method, OTHER_COLOUR)
             top.plot(*tip[:, :2].T, color=colour, lw=0.9)
             side.plot(s, tip[:, 2], color=colour, lw=0.9)
             off.semilogy(s, np.maximum(distance, 1e-3), color=colour, lw=0.9)
@@ -178,7 +181,7 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
             ):
                 axes.plot(x, y, marker, color=face, mec="white", mew=0.6, ms=7, zorder=5)
         off.axhline(CLEARANCE_MM, color=_GREY, ls="--", lw=1)
-        off.yaxis.set_major_formatter(_plain)
+        off.yaxis.set_major_formatter(plain)
         reached = sum(t["reached"] for t in mine.values())
         top.set_title(f"{method}\n{reached} of these {len(mine)} reached the end", fontsize=10)
         if not thin:
@@ -195,7 +198,7 @@ def draw_paths(path: Path, part: str, trials: Mapping[str, Row], paths: Paths) -
     off.text(0.02, CLEARANCE_MM, "nozzle clearance", color=_GREY, fontsize=8, va="bottom",
              transform=off.get_yaxis_transform())  # fmt: skip
     handles = [mpl.lines.Line2D([], [], color=_BLUE, lw=5, alpha=0.3, label="desired path")]
-    handles.append(mpl.lines.Line2D([], [], color=_OTHER_COLOUR, lw=1, label="tip, from its hover on"))
+    handles.append(mpl.lines.Line2D([], [], color=OTHER_COLOUR, lw=1, label="tip, from its hover on"))
     for outcome in dict.fromkeys(t["outcome"] for t in here.values()):
         marker, face, label = _OUTCOMES[outcome]
         handles.append(mpl.lines.Line2D([], [], color=face, marker=marker, ls="", ms=7, label=label))
@@ -237,7 +240,7 @@ def draw_rmse(path: Path, rows: Sequence[Row], trials: Sequence[Row]) -> None:
                     == (method, part, row["training_seed"])
                 ]
             )
-            colour = _COLOURS.get(method, _OTHER_COLOUR)
+            colour = COLOURS.get(method, OTHER_COLOUR)
             if len(values):
                 scatter = y + 0.13 + 0.22 * rng.random(len(values))
                 axes.plot(values, scatter, ".", color=colour, ms=4, alpha=0.6, mew=0)
@@ -248,7 +251,7 @@ def draw_rmse(path: Path, rows: Sequence[Row], trials: Sequence[Row]) -> None:
             )  # fmt: skip
         axes.set(title=part, xlabel="RMSE [mm]")
         axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(_plain)
+        axes.xaxis.set_major_formatter(plain)
         axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
         axes.text(
             0.985, -0.5, "reached", transform=axes.get_yaxis_transform(),
@@ -298,7 +301,7 @@ def draw_generalisation(path: Path, rows: Sequence[Row], trials: Mapping[str, Ro
         for name, trial in trials.items():
             if (trial["method"], trial["workpiece"]) == (drawn, part):
                 marker, face, _ = _OUTCOMES[trial["outcome"]]
-                axes.plot(*paths[name][:, [0, across]].T, color=_COLOURS.get(drawn, _OTHER_COLOUR), lw=0.8)
+                axes.plot(*paths[name][:, [0, across]].T, color=COLOURS.get(drawn, OTHER_COLOUR), lw=0.8)
                 axes.plot(*paths[name][-1, [0, across]], marker, color=face, ms=5, mec="white", mew=0.5)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xticks([])
