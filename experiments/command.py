@@ -53,6 +53,21 @@ def add_run(parser: argparse.ArgumentParser, out: str) -> None:
     parser.add_argument("--out", type=Path, default=Path(out), help="folder (default: %(default)s)")
 
 
+def add_trials(parser: argparse.ArgumentParser, out: str, each: str) -> None:
+    """Adds the options of a command that runs trials on the nominal parts.
+
+    Args:
+        parser: The command line.
+        out: The default folder.
+        each: What gets so many trials.
+    """
+    parser.add_argument("--workpiece", action="append", choices=NAMES, help="may be repeated (default: all)")
+    parser.add_argument("--trials", type=int, default=1, help=f"of each {each} (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=500_000, help="of the first trial (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path(out), help="folder (default: %(default)s)")
+
+
 def run(work: Callable[[], str], out: Path) -> int:
     """Does a command's work and prints what came of it.
 

@@ -25,7 +25,7 @@ from agents import engines
 from agents.filters import FILTERS, Filtered
 from experiments import command, results, trials
 from experiments.trials import Row, Trial
-from seal_gym.core.errors import ConfigError, SealGymError
+from seal_gym.core.errors import ConfigError
 from seal_gym.envs.config import PERCEPTIONS
 from seal_gym.envs.core import SealCore
 from seal_gym.envs.leaves import ObstacleLeaf
@@ -349,21 +349,11 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         choices=tuple(dict.fromkeys(m.policy for m in METHODS)),
         help="may be repeated (default: all)",
     )
-    parser.add_argument(
-        "--workpiece", action="append", choices=catalogue.NAMES, help="may be repeated (default: all)"
-    )
-    parser.add_argument(
-        "--trials", type=int, default=1, help="of each method and part (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=500_000, help="of the first trial (default: %(default)s)")
+    command.add_trials(parser, "out/obstacle", "method and part")
     parser.add_argument(
         "--severity", type=float, default=1.0, help="time the fist stays (default: %(default)s)"
     )
     parser.add_argument("--perception", default=PERCEPTIONS[0], choices=PERCEPTIONS)
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/obstacle"), help="folder (default: %(default)s)"
-    )
     options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if not 0.0 < options.severity <= 20.0:
         parser.error(f"--severity {options.severity}: must be in (0, 20]")
@@ -380,19 +370,14 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
+
+    def work() -> str:
         results.log_run(NAME, "Obstacle", options.seed + options.trials - 1)
-        log = options.out / f"{NAME}.trials.jsonl"
-        rows = trials.run_all(
-            plan(options), engine=engines.local(options.jobs), log=log, title="passing", work=run
-        )
-        text = write(rows, options)
-    except SealGymError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    print(f"\n{text}\n\nwritten to {options.out}/")
-    return 0
+        log, engine = options.out / f"{NAME}.trials.jsonl", engines.local(options.jobs)
+        rows = trials.run_all(plan(options), engine=engine, log=log, title="passing", work=run)
+        return write(rows, options)
+
+    return command.run(work, options.out)
 
 
 if __name__ == "__main__":

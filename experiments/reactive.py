@@ -25,7 +25,7 @@ from agents.expert import RmpExpert
 from agents.rollouts import play_once
 from experiments import command, results, trials
 from experiments.trials import Row, Trial
-from seal_gym.core.errors import ConfigError, SealGymError
+from seal_gym.core.errors import ConfigError
 from seal_gym.rmp import SealingCfg, TravelCfg
 from seal_gym.vision.perception import PerceptionCfg
 from seal_gym.workpieces import catalogue
@@ -273,19 +273,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         prog="python -m experiments.reactive", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--policy", action="append", choices=POLICIES, help="may be repeated (default: all)")
-    parser.add_argument(
-        "--workpiece", action="append", choices=catalogue.NAMES, help="may be repeated (default: all)"
-    )
-    parser.add_argument(
-        "--trials", type=int, default=1, help="of each part, variant and policy (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=500_000, help="of the first trial (default: %(default)s)")
+    command.add_trials(parser, "out/reactive", "part, variant and policy")
     parser.add_argument(
         "--severity", type=float, default=1.0, help="of the dynamic regime (default: %(default)s)"
-    )
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/reactive"), help="folder (default: %(default)s)"
     )
     options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
     if not 0.0 < options.severity <= 20.0:
@@ -303,19 +293,14 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
+
+    def work() -> str:
         results.log_run(NAME, "Reactive control", options.seed + options.trials - 1)
-        log = options.out / f"{NAME}.trials.jsonl"
-        rows = trials.run_all(
-            plan(options), engine=engines.local(options.jobs), log=log, title="sealing", work=run
-        )
-        text = write(rows, options)
-    except SealGymError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    print(f"\n{text}\n\nwritten to {options.out}/")
-    return 0
+        log, engine = options.out / f"{NAME}.trials.jsonl", engines.local(options.jobs)
+        rows = trials.run_all(plan(options), engine=engine, log=log, title="sealing", work=run)
+        return write(rows, options)
+
+    return command.run(work, options.out)
 
 
 if __name__ == "__main__":
