@@ -14,8 +14,8 @@ _REACH = 4.5  # how far along motion is looked for, in widths of the fit
 _SLOPE_OVER = 3  # neighbours on either side from which an edge's slope is taken
 _GAP_M = 2.0e-3  # farther apart new edges have nothing between them
 _ALONG = 0.06  # mean square of slopes about their mean with which a shift along the seam is half believed
-_STEP_M = 0.25e-3  # travel or motion after which a frame's edges are kept beside the last ones
-_CARRIED_M = 0.1e-3
+_STEP_M = 0.25e-3  # travel after which a frame's edges are kept beside the last ones
+_CARRIED_M = 0.1e-3  # motion of the part after which they are
 _FADE = 0.03  # share of a velocity along the seam that is forgotten in a frame that does not show it
 
 

@@ -33,7 +33,7 @@ class PerceptionCfg:
             on the plate's side, is not believed.
         level_step: Nor is one where they change by more from one frame to the next.
         level_gain: Share of a frame in the usual levels.
-        memory_s: Age at which a remembered edge is dropped [s].
+        memory_s: Age at which a remembered edge is dropped [s]; while neither gun nor part move none ages.
         ahead_px: How far ahead the front view's edge is remembered [px].
         sigma_m: Width of the fit around the tip [m].
         bend: Standard deviation of the curve's quadratic coefficient [1/m].
