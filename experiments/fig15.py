@@ -146,6 +146,7 @@ def make(options: argparse.Namespace) -> str:
         renderer="raycast" if options.perception == "vision" else "none",
         regime="dynamic",
         text=text,
+        module=NAME,
     )
     return table
 

@@ -183,6 +183,7 @@ def write(
     regime: str,
     text: str | None = None,
     more: Mapping[str, Any] | None = None,
+    module: str | None = None,
 ) -> None:
     """Writes ``<name>.json``, ``.csv`` and ``.md``.
 
@@ -195,11 +196,12 @@ def write(
         regime: ``"static"`` or ``"dynamic"``.
         text: Markdown for people; by default ``table`` of the rows, which are then a control table's.
         more: Further entries of the JSON, before the trials.
+        module: Of the experiment, if it has another name than the table.
     """
     document = {
         "name": name,
         "version": seal_gym.__version__,
-        "command": command(name),
+        "command": command(module or name),
         "git_commit": commit(),
         "stack": stack(),
         "renderer": renderer,
