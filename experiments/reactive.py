@@ -213,7 +213,7 @@ def draw(file: Path, table: Sequence[Row]) -> None:
                     y = names.index(r["without"]) + offset
                     ends = r["reached_ci"] if key == "reached_pct" else r["rmse_mm_ci"]
                     if r[key] is None:
-                        ax.text(0.5, y, "none", transform=ax.get_yaxis_transform(), fontsize=8)
+                        ax.text(0.4, y, "none reached", transform=ax.get_yaxis_transform(), fontsize=8)
                         continue
                     if ends:
                         ax.plot(ends, (y, y), color=_COLOURS[policy], lw=1.6)
@@ -225,7 +225,7 @@ def draw(file: Path, table: Sequence[Row]) -> None:
         axes[1, column].set_xlim(left=0.0)
     for ax in axes[:, 0]:
         ax.set_yticks(range(len(names)), [VARIANTS[n].label for n in names], fontsize=9)
-        ax.invert_yaxis()
+    axes[0, 0].invert_yaxis()  # shared by all
     handles = [Line2D([], [], color=_COLOURS[p], marker="o", label=p) for p in policies]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(policies))
     figure.suptitle("Moving parts: reactive control with one part of it switched off")
