@@ -21,7 +21,6 @@ import mujoco
 import numpy as np
 
 import agents
-from agents import engines
 from agents.filters import FILTERS, Filtered
 from experiments import command, results, trials
 from experiments.trials import Row, Trial
@@ -349,15 +348,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         choices=tuple(dict.fromkeys(m.policy for m in METHODS)),
         help="may be repeated (default: all)",
     )
-    command.add_trials(parser, "out/obstacle", "method and part")
-    parser.add_argument(
-        "--severity", type=float, default=1.0, help="time the fist stays (default: %(default)s)"
-    )
+    command.add_trials(parser, NAME, "method and part", "time the fist stays")
     parser.add_argument("--perception", default=PERCEPTIONS[0], choices=PERCEPTIONS)
-    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
-    if not 0.0 < options.severity <= 20.0:
-        parser.error(f"--severity {options.severity}: must be in (0, 20]")
-    return options
+    return command.checked_trials(parser, arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -370,14 +363,7 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-
-    def work() -> str:
-        results.log_run(NAME, "Obstacle", options.seed + options.trials - 1)
-        log, engine = options.out / f"{NAME}.trials.jsonl", engines.local(options.jobs)
-        rows = trials.run_all(plan(options), engine=engine, log=log, title="passing", work=run)
-        return write(rows, options)
-
-    return command.run(work, options.out)
+    return command.run_trials(NAME, plan(options), run, write, options)
 
 
 if __name__ == "__main__":

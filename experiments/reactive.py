@@ -20,7 +20,6 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import agents
-from agents import engines
 from agents.expert import RmpExpert
 from agents.rollouts import play_once
 from experiments import command, results, trials
@@ -273,14 +272,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         prog="python -m experiments.reactive", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--policy", action="append", choices=POLICIES, help="may be repeated (default: all)")
-    command.add_trials(parser, "out/reactive", "part, variant and policy")
-    parser.add_argument(
-        "--severity", type=float, default=1.0, help="of the dynamic regime (default: %(default)s)"
-    )
-    options = command.checked(parser, arguments, trials=1, jobs=1, seed=0)
-    if not 0.0 < options.severity <= 20.0:
-        parser.error(f"--severity {options.severity}: must be in (0, 20]")
-    return options
+    command.add_trials(parser, NAME, "part, variant and policy", "of the dynamic regime")
+    return command.checked_trials(parser, arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -293,14 +286,7 @@ def main(arguments: list[str] | None = None) -> int:
         Exit status: 0 if it ran to the end.
     """
     options = parse(arguments)
-
-    def work() -> str:
-        results.log_run(NAME, "Reactive control", options.seed + options.trials - 1)
-        log, engine = options.out / f"{NAME}.trials.jsonl", engines.local(options.jobs)
-        rows = trials.run_all(plan(options), engine=engine, log=log, title="sealing", work=run)
-        return write(rows, options)
-
-    return command.run(work, options.out)
+    return command.run_trials(NAME, plan(options), run, write, options)
 
 
 if __name__ == "__main__":
