@@ -175,7 +175,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         if not self._running:
             raise gym.error.ResetNeeded("call reset() before step()")
         core = self.core
-        result: StepResult = core.step(as_action(action, (core.adapter.size,), core.cfg.control)[None])
+        result: StepResult = core.step(as_action(action, (core.action_size,), core.cfg.control)[None])
         ended, self._ended = self._ended, self._ended or bool(result.terminated[0] or result.timeout[0])
         observation = first(core.observe())
         self._show()
