@@ -9,7 +9,9 @@ from collections.abc import Callable
 import numpy as np
 
 from seal_gym.core.kinematics import tip_kinematics
-from seal_gym.planning import ik, ik_kernel
+from seal_gym.planning import ik, ik_kernel, newton
+
+_HOME = np.radians([-4.0, -117.8, -94.7, -102.4, 87.2, -92.8])
 
 
 def cases(batch: int) -> dict[str, Callable[[], object]]:
@@ -19,6 +21,7 @@ def cases(batch: int) -> dict[str, Callable[[], object]]:
     return {
         "closed form, numpy": lambda: ik.solve(poses),
         "closed form, compiled": lambda: ik_kernel.solve(poses),
+        "Newton from a home posture": lambda: newton.solve(poses, _HOME, np.random.default_rng(1)),
     }
 
 
