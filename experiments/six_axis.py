@@ -2,8 +2,9 @@
 
 Three links carried round by shoulder and wrist: link i stands at the pitch a_i and the roll b_i that its
 joints add up to, all at the yaw phi_0. As printed, links change their length (z of Eq. 3: ``l1 s1 s0`` for
-``l1 s1``, and ``- s135 s2 s4`` for ``+ s135 s2 s4`` in the bracket of l3), Eqs. 6 and 16-21 err in a sign or a
-term, and Eq. 22 repeats dx in its rows of y and z. Every entry here is the derivative of the mended Eqs. 1-3.
+``l1 s1``, and ``- s135 s2 s4`` for ``+ s135 s2 s4`` in the bracket of l3), Eqs. 6 and 16-21 err in a sign or
+a term, and Eq. 22 repeats dx in its rows of y and z. Every entry here is the derivative of the mended
+Eqs. 1-3.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Inverse kinematics by linearisation, as Carvajal and Martinez-Garcia, Eqs. 35-38, damped and within limits.
 
 The paper truncates the Taylor series of the forward kinematics after its linear term and solves
-``J Phi_{t+1} = zeta``. Eqs. 36-37 leave the target out of zeta; with it, ``zeta = (p_d - p_t) + J Phi_t``, this
-is Newton's method, ``J (Phi_{t+1} - Phi_t) = p_d - p_t``. Here the step is damped near singularities,
+``J Phi_{t+1} = zeta``. Eqs. 36-37 leave the target out of zeta; with it, ``zeta = (p_d - p_t) + J Phi_t``,
+this is Newton's method, ``J (Phi_{t+1} - Phi_t) = p_d - p_t``. Here the step is damped near singularities,
 ``J^T (J J^T + lambda^2 I)^-1 e`` with lambda^2 in proportion to the squared error (after T. Sugihara,
 "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", 2011), so that the last steps
 are Newton's.
