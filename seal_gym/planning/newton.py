@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from seal_gym.core.errors import is_number, require
 from seal_gym.core.frames import Array
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_UPPER, T_TOOL0_TIP, tip_kinematics
+from seal_gym.planning.ik import within
 from seal_gym.planning.tau_jerk_pose import rotation_vector
 
-_TURN = 2.0 * np.pi
 _MIN_DAMPING = 1e-12  # keeps the system solvable at a singularity that is the goal
 
 
@@ -148,26 +148,6 @@ def solve(
         if not len(left):
             break
     return NewtonSolution(found, iterations, restarts)
-
-
-def within(q: Array, lower: Array, upper: Array) -> Array:
-    """The same postures within limits: by whole turns where that does, else at the nearest limit.
-
-    Args:
-        q: Shape (..., d), rad.
-        lower: Shape (d,), rad.
-        upper: Shape (d,), rad.
-
-    Returns:
-        Shape (..., d), rad.
-    """
-    outside = (q < lower) | (q > upper)
-    # Of the turns that end within, the one closest to the limit that was passed.
-    turned = np.where(
-        q > upper, q - _TURN * np.ceil((q - upper) / _TURN), q + _TURN * np.ceil((lower - q) / _TURN)
-    )
-    fits = outside & (turned >= lower) & (turned <= upper)
-    return np.where(fits, turned, np.clip(q, lower, upper))
 
 
 def _descend(

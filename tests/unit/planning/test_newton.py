@@ -87,14 +87,6 @@ def test_narrow_limits_are_kept():
     np.testing.assert_allclose(forward(found), forward(q), atol=1e-7)
 
 
-def test_within_turns_joints_back_and_else_stops_them():
-    lower, upper = np.array([-4.0, -1.0, -4.0, 1.0]), np.array([4.0, 1.0, 4.0, 9.0])
-    q = np.array([4.5, 1.5, -4.5, 0.5])
-    expected = [4.5 - 2 * np.pi, 1.0, -4.5 + 2 * np.pi, 0.5 + 2 * np.pi]
-    np.testing.assert_allclose(newton.within(q, lower, upper), expected)
-    np.testing.assert_array_equal(newton.within(lower, lower, upper), lower)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
