@@ -1,7 +1,9 @@
 """Closed-form inverse kinematics of the UR5, compiled: microseconds for one pose.
 
 The branches and conventions are ``ik.solve``'s, which stays for the environments: published runs repeat to
-the bit, and compiled code rounds otherwise in the last place.
+the bit, and compiled code rounds otherwise in the last place. What differs is at singularities alone: the
+stretched arm is found from poses that other software has rounded too, and where the wrist is singular joint 6
+takes an angle with which the forearm reaches the pose if 0 does not do.
 """
 
 import math
@@ -14,7 +16,7 @@ from seal_gym.core.kinematics import DH_A, DH_COS_ALPHA, DH_D, DH_SIN_ALPHA, T_T
 from seal_gym.planning.ik import BRANCHES
 
 _SINGULAR = 1e-9
-_STRETCHED = 1e-12
+_STRETCHED = 1e-9  # of the elbow's cosine: a pose 0.2 nm out of reach counts as that of the stretched arm
 
 
 @kernel
@@ -27,14 +29,28 @@ def _link(k: int, angle: float, ca: Array, sa: Array, out: Array) -> None:
 
 
 @kernel
+def _free_q6(r16: Array, x: float, y: float, d5: float, near: float, far: float) -> float:
+    """Joint 6 where the wrist is singular and joints 4 and 6 share the turn: 0, or what the forearm reaches.
+
+    Joint 3's origin lies on a circle of radius d5 about (x, y) of frame 1, opposite to joint 5's axis.
+    """
+    reach = math.hypot(x + d5 * r16[0, 1], y + d5 * r16[1, 1])
+    if near <= reach <= far:
+        return 0.0
+    side = (1.0 if reach > far else -1.0) / math.hypot(x, y)
+    ux, uy = side * x, side * y  # joint 5's axis
+    return math.atan2(-(r16[0, 0] * ux + r16[1, 0] * uy), -(r16[0, 1] * ux + r16[1, 1] * uy))
+
+
+@kernel
 def _solve(  # noqa: PLR0912  # small matrix products written out, in one pass along the chain
     poses: Array, tool: Array, d: Array, a: Array, ca: Array, sa: Array, out: Array
 ) -> None:
     r06 = np.empty((3, 3))
     p06 = np.empty(3)
     r01, r45, r56 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    r46, r14, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    p13 = np.empty(3)
+    r46, r14, r16 = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    p13, p16 = np.empty(3), np.empty(3)
     for i in range(poses.shape[0]):
         # T_0_6 = T_base_tip T_tool0_tip^-1
         for r in range(3):
@@ -59,19 +75,26 @@ def _solve(  # noqa: PLR0912  # small matrix products written out, in one pass a
             cosine = r06[0, 0] * s1 - r06[1, 0] * c1
             s5 = wrist * math.hypot(sine, cosine)
             q5 = math.atan2(s5, r06[0, 2] * s1 - r06[1, 2] * c1)
-            q6 = 0.0 if abs(s5) < _SINGULAR else math.atan2(wrist * sine, wrist * cosine)
             _link(0, q1, ca, sa, r01)
+            for r in range(3):
+                for c in range(3):
+                    r16[r, c] = r01[0, r] * r06[0, c] + r01[1, r] * r06[1, c] + r01[2, r] * r06[2, c]
+                p16[r] = r01[0, r] * p06[0] + r01[1, r] * p06[1] + r01[2, r] * (p06[2] - d[0])
+            if abs(s5) < _SINGULAR:
+                x5, y5 = p16[0] - d[5] * r16[0, 2], p16[1] - d[5] * r16[1, 2]
+                q6 = _free_q6(r16, x5, y5, d[4], abs(a[1] - a[2]), abs(a[1] + a[2]))
+            else:
+                q6 = math.atan2(wrist * sine, wrist * cosine)
             _link(4, q5, ca, sa, r45)
             _link(5, q6, ca, sa, r56)
             for r in range(3):
                 for c in range(3):
                     r46[r, c] = r45[r, 0] * r56[0, c] + r45[r, 1] * r56[1, c] + r45[r, 2] * r56[2, c]
-                    half[r, c] = r01[0, r] * r06[0, c] + r01[1, r] * r06[1, c] + r01[2, r] * r06[2, c]
             for r in range(3):
                 for c in range(3):
-                    r14[r, c] = half[r, 0] * r46[c, 0] + half[r, 1] * r46[c, 1] + half[r, 2] * r46[c, 2]
+                    r14[r, c] = r16[r, 0] * r46[c, 0] + r16[r, 1] * r46[c, 1] + r16[r, 2] * r46[c, 2]
             for r in range(3):
-                p13[r] = r01[0, r] * p06[0] + r01[1, r] * p06[1] + r01[2, r] * (p06[2] - d[0])
+                p13[r] = p16[r]
                 for m in range(3):
                     p46 = (d[4] if m == 2 else 0.0) + r45[m, 2] * d[5]
                     p13[r] -= r14[r, m] * p46

@@ -46,6 +46,17 @@ def test_solutions_keep_to_the_limits_and_are_closed_form_branches(reachable, so
     assert np.mean(np.nanmin(apart, axis=1) < 1e-4) > 0.99
 
 
+@pytest.mark.parametrize(
+    ("joint", "angle"), [(4, 0.0), (4, np.pi), (2, 0.0)], ids=["wrist", "turned", "elbow"]
+)
+def test_singular_poses_are_reached(reference_arm, joint, angle):
+    q = np.random.default_rng(7).uniform(JOINT_LOWER, JOINT_UPPER, (500, 6))
+    q[:, joint] = angle
+    poses = reference_arm.tip(q)
+    found = newton.solve(poses, START, rng()).q
+    np.testing.assert_allclose(reference_arm.tip(found), poses, atol=1e-6)
+
+
 def test_the_same_generator_gives_the_same_postures(reachable, solution):
     np.testing.assert_array_equal(newton.solve(reachable[1], START, rng()).q, solution.q)
 
