@@ -84,9 +84,7 @@ def _varying_width() -> BeadCase:
 
 def _zig_zag() -> BeadCase:
     left, right = _planar([(0, 0), (0.08, 0.04), (0.16, 0), (0.24, 0.04), (0.32, 0)], 7.5e-3)
-    return BeadCase(
-        name="zig_zag", title="zig-zag", left=left, right=right, spread_m=12e-3, duration_s=1.2
-    )
+    return BeadCase(name="zig_zag", title="zig-zag", left=left, right=right, spread_m=12e-3, duration_s=1.2)
 
 
 def _square(side_m: float) -> list[tuple[float, float]]:

@@ -26,6 +26,8 @@ class BeadCfg:
         drag_rad: Largest |kappa| [rad].
         speed_m_per_s: Smallest and largest speed along either edge [m/s].
         weights: k1 (directions across the edges), k2 (drag), k3 (length of the nozzle's path).
+        smoothing: k4, of the squared second derivatives of ln mu and kappa by the share of the left edge.
+            Ours: it picks the smooth one of paths that the printed cost hardly tells apart.
         height_tolerance_m: By how much the height may differ from its mean, between nodes too [m].
         cost_intervals: N of the printed cost, a sum over N + 1 nodes equidistant in time. The cost is
             evaluated as the integral that this sum stands for, so that grids can be compared.
@@ -37,6 +39,7 @@ class BeadCfg:
     drag_rad: float = np.deg2rad(15.0)
     speed_m_per_s: tuple[float, float] = (0.1, 1.0)
     weights: tuple[float, float, float] = (1.0, 10.0, 100.0)
+    smoothing: float = 1e-5
     height_tolerance_m: float = 1e-5
     cost_intervals: int = 60
 
@@ -45,10 +48,7 @@ class BeadCfg:
         for name, unit in (("distance_m", "m"), ("speed_m_per_s", "m/s")):
             value = getattr(self, name)
             require(
-                isinstance(value, tuple)
-                and len(value) == 2
-                and all(map(is_number, value))
-                and 0.0 < value[0] < value[1] <= 10.0,
+                len(value) == 2 and all(map(is_number, value)) and 0.0 < value[0] < value[1] <= 10.0,
                 f"BeadCfg.{name} = {value!r}: must be (smallest, largest) in {unit} with 0 < smallest < "
                 "largest <= 10",
                 ConfigError,
@@ -56,7 +56,8 @@ class BeadCfg:
         top = (np.pi - self.nozzle.fan_angle_rad) / 2.0
         require(
             is_number(self.tilt_rad) and 0.0 < self.tilt_rad < top,
-            f"BeadCfg.tilt_rad = {self.tilt_rad!r}: must be in (0, {top:.4g}), a right angle less half the fan",
+            f"BeadCfg.tilt_rad = {self.tilt_rad!r}: must be in (0, {top:.4g}) rad, below a right angle less "
+            "half the fan",
             ConfigError,
         )
         require(
@@ -65,10 +66,13 @@ class BeadCfg:
             ConfigError,
         )
         require(
-            isinstance(self.weights, tuple)
-            and len(self.weights) == 3
-            and all(is_number(w) and w >= 0.0 for w in self.weights),
+            np.shape(self.weights) == (3,) and all(is_number(w) and w >= 0.0 for w in self.weights),
             f"BeadCfg.weights = {self.weights!r}: must be three numbers >= 0",
+            ConfigError,
+        )
+        require(
+            is_number(self.smoothing) and 0.0 <= self.smoothing <= 1.0,
+            f"BeadCfg.smoothing = {self.smoothing!r}: must be in [0, 1]",
             ConfigError,
         )
         require(

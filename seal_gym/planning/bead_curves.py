@@ -55,7 +55,7 @@ def bezier(control: Array, t: Array) -> Array:
     log_count = gammaln(m + 1) - gammaln(k + 1) - gammaln(m - k + 1)
     weight = np.exp(log_count + xlogy(k, t[:, None]) + xlog1py(m - k, -t[:, None]))
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nk,nkd->nd", weight, control[k])
+    return np.asarray(np.einsum("nk,nkd->nd", weight, control[k]))
 
 
 def bezier_smooth(points: ArrayLike, spread_m: float) -> Array:
@@ -207,8 +207,8 @@ class Edges:
         width = np.linalg.norm(edges.chord(k), axis=1)
         require(
             bool(width.min() > 1e-4),
-            f"edges: only {width.min() * 1e3:.3g} mm apart at {k[width.argmin()] * 100:.0f} % of their length: "
-            "they must stay at least 0.1 mm apart and run the same way",
+            f"edges: only {width.min() * 1e3:.3g} mm apart at {k[width.argmin()] * 100:.0f} % of their "
+            "length: they must stay at least 0.1 mm apart and run the same way",
             SeamError,
         )
         return edges

@@ -1,8 +1,8 @@
 """A fan nozzle over the two edges of a bead: closed forms for heights, distances, tilt and pose.
 
-Berg 3.1.2. The nozzle at p spreads its flow evenly over the angle theta; the fan's borders meet the left edge
-in x and the right one in y. In the triangle x-y-p: a = |xy|, b = |yp|, c = |xp|, beta is the angle at x, gamma
-at y. The functions of scalars take numpy arrays and CasADi expressions alike, so that solver and
+Berg 3.1.2. The nozzle at p spreads its flow evenly over the angle theta; the fan's borders meet the left
+edge in x and the right one in y. In the triangle x-y-p: a = |xy|, b = |yp|, c = |xp|, beta is the angle at x,
+gamma at y. The functions of scalars take numpy arrays and CasADi expressions alike, so that solver and
 check share one formula; tests hold each against brute-force geometry.
 """
 
@@ -46,7 +46,7 @@ class NozzleCfg:
 
 
 def distance_ratio(u_dot: Any, w_dot: Any, sin_eta: Any, sin_zeta: Any, xp: Any = np) -> Any:
-    """mu = b / c for which both edges get the same height.
+    """Ratio mu = b / c for which both edges get the same height.
 
     Source: Berg Eq. 3.28.
 

@@ -16,8 +16,8 @@ from seal_gym.planning.bead_config import BeadCfg, BeadNodes
 from seal_gym.planning.bead_curves import Edges
 from seal_gym.planning.bead_geometry import Across, log_height, ratio_of_tilt
 from seal_gym.planning.bead_symbols import (
-    SMOOTH_M,
     SMOOTH_RAD,
+    SMOOTH_SHARE,
     curve_functions,
     load_casadi,
     node_function,
@@ -81,9 +81,13 @@ def _symbols(ca: Any, edges: Edges, duration_s: float, cfg: BeadCfg, u_m: Array)
     at_nodes = node_function(cfg.nozzle).map(n)(
         edges.left(u_m).T, edges.left.tangent(u_m).T, right, tangent, u_dot, w_dot, drag
     )
+    log_h, log_mu, log_b, log_c, position, spin = at_nodes
     dt = 2.0 * np.diff(u_m)[None] / (u_dot[:, :-1] + u_dot[:, 1:])
     weight = (ca.horzcat(dt, 0.0) + ca.horzcat(0.0, dt)) / (2.0 * duration_s)
-    return _Symbols(ln_u_dot, ln_w_dot, w, drag, ca.MX.sym("ln_h"), *at_nodes, dt, weight)
+    ln_h = ca.MX.sym("ln_h")
+    return _Symbols(
+        ln_u_dot, ln_w_dot, w, drag, ln_h, log_h, log_mu, log_b, log_c, position, spin, dt, weight
+    )
 
 
 class _Rules:
@@ -115,14 +119,27 @@ def _limits(at: _Symbols, cfg: BeadCfg) -> dict[str, tuple[Any, float, float]]:
     }
 
 
-def _cost(ca: Any, at: _Symbols, cfg: BeadCfg) -> Any:
+def _cost(ca: Any, at: _Symbols, cfg: BeadCfg, u_m: Array) -> Any:
     """Berg Eq. 3.61, its sums over equidistant times as integrals."""
     k1, k2, k3 = cfg.weights
     moved = at.position[:, 1:] - at.position[:, :-1]
     modulus = smooth_modulus(at.drag, SMOOTH_RAD, ca)
-    return (cfg.cost_intervals + 1) * ca.sum2(at.weight * (k1 * at.spin + k2 * modulus)) + k3 * ca.sum2(
-        ca.sqrt(ca.sum1(moved**2) + SMOOTH_M**2)
-    )
+    # In a tight inner corner the nozzle stops and turns back, where its path's length has a kink.
+    rounding = SMOOTH_SHARE * np.diff(u_m)[None]
+    length = ca.sum2(ca.sqrt(ca.sum1(moved**2) + rounding**2))
+    return (cfg.cost_intervals + 1) * ca.sum2(at.weight * (k1 * at.spin + k2 * modulus)) + k3 * length
+
+
+def _roughness(ca: Any, at: _Symbols, share: Array) -> Any:
+    """Integral of the squared second derivatives of ln mu and kappa by the share of the left edge."""
+    step = np.diff(share)[None]
+    middle = (step[:, 1:] + step[:, :-1]) / 2.0
+
+    def of(value: Any) -> Any:
+        slope = (value[:, 1:] - value[:, :-1]) / step
+        return ca.sum2((slope[:, 1:] - slope[:, :-1]) ** 2 / middle)
+
+    return of(at.log_mu) + of(at.drag)
 
 
 def solve_program(
@@ -187,9 +204,10 @@ def solve_program(
     else:
         for name in GROUPS[:3]:  # speeds have bounds as unknowns
             rules.add(*limits[name])
-        objective = _cost(ca, at, cfg)
+        share = guess.u_m / edges.left.length_m
+        objective = _cost(ca, at, cfg, guess.u_m) + cfg.smoothing * _roughness(ca, at, share)
 
-    symbols, low, high, start = zip(*unknowns, strict=True)
+    symbols, lowest, highest, start = zip(*unknowns, strict=True)
     solver = ca.nlpsol(
         "bead",
         "ipopt",
@@ -207,8 +225,8 @@ def solve_program(
     )
     found = solver(
         x0=np.concatenate(start),
-        lbx=np.concatenate(low),
-        ubx=np.concatenate(high),
+        lbx=np.concatenate(lowest),
+        ubx=np.concatenate(highest),
         lbg=np.concatenate(rules.low),
         ubg=np.concatenate(rules.high),
     )

@@ -63,8 +63,8 @@ def footprint(path: BeadPath, edges: Edges, fan_angle_rad: float) -> Footprint:
 
     The flow spreads evenly over the fan's angle phi. While the volume dV leaves the nozzle, the sliver d phi
     sweeps the area |dq/dphi x dq/dV| dphi dV of the surface at its hit q, so that the height is
-    1 / (theta |dq/dphi x dq/dV|). Both derivatives are central differences of ray-surface hits. Volume in place
-    of time makes the measure indifferent to a slow-down that the flow follows.
+    1 / (theta |dq/dphi x dq/dV|). Both derivatives are central differences of ray-surface hits. Volume in
+    place of time makes the measure indifferent to a slow-down that the flow follows.
 
     Source: the idea of Berg Eqs. 3.19-3.23, without its closed forms.
 
@@ -106,13 +106,13 @@ def _hits(path: BeadPath, edge: Curve, other: Curve, angle_rad: float) -> Array:
     ray = np.sin(angle_rad) * x - np.cos(angle_rad) * z
     share = _nearest_to_rays(path.position_m, ray, edge)
     for _ in range(_CORRECTIONS):
-        # The surface's tangent plane where the edge has this share; right if the hit is straight across there.
+        # The surface's tangent plane at this share; the right one if the hit is straight across from there.
         foot, tangent = edge(share * edge.length_m), edge.tangent(share * edge.length_m)
         chord = normalise(other(share * other.length_m) - foot)
         normal = cross(tangent, chord)
         reach = np.sum((foot - path.position_m) * normal, -1) / np.sum(ray * normal, -1)
         hit = path.position_m + reach[:, None] * ray
-        aside = np.sum((hit - foot) * cross(normal, chord), -1) / np.sum(normal**2, -1)
+        aside = np.sum((hit - foot) * cross(chord, normal), -1) / np.sum(normal**2, -1)
         share = np.clip(share + aside / edge.length_m, 0.0, 1.0)
     return np.asarray(hit)
 
@@ -131,11 +131,9 @@ def _nearest_to_rays(position: Array, ray: Array, edge: Curve) -> Array:
 
 def _distance(points: Array, edge: Curve) -> Array:
     """Distances of points from an edge, shape (n,), m."""
-    vertex = edge(np.linspace(0.0, edge.length_m, _GRID + 1))
-    start, leg = vertex[:-1], np.diff(vertex, axis=0)
-    square = np.sum(leg**2, axis=1)
-    out = np.empty(len(points))
-    for k, p in enumerate(points):
-        along = np.clip(np.sum((p - start) * leg, axis=1) / square, 0.0, 1.0)
-        out[k] = np.sqrt(np.min(np.sum((start + along[:, None] * leg - p) ** 2, axis=1)))
-    return out
+    grid = np.linspace(0.0, edge.length_m, _GRID + 1)
+    vertices = edge(grid)
+    s = np.array([grid[np.argmin(np.sum((vertices - p) ** 2, axis=1))] for p in points])
+    for _ in range(3):  # along the tangent to where it is straight across
+        s = np.clip(s + np.sum((points - edge(s)) * edge.tangent(s), axis=1), 0.0, edge.length_m)
+    return np.asarray(np.linalg.norm(points - edge(s), axis=1))

@@ -11,7 +11,7 @@ from seal_gym.planning.bead_curves import Curve
 from seal_gym.planning.bead_geometry import NozzleCfg, distance_ratio, distances, log_height, tilt_of_ratio
 
 SMOOTH_RAD = 1e-3  # |kappa| is rounded within so much of zero: solvers want derivatives
-SMOOTH_M = 1e-5
+SMOOTH_SHARE = 0.1  # |dp| within so much of the step along the edge
 
 
 def load_casadi() -> Any:
@@ -32,6 +32,8 @@ def load_casadi() -> Any:
 def curve_functions(curve: Curve, name: str) -> tuple[Any, Any]:
     """A curve and its tangent as CasADi functions of arc length.
 
+    Beyond its ends, where solvers may step, the curve goes straight on.
+
     Args:
         curve: The curve.
         name: Of the functions, which CasADi wants.
@@ -40,14 +42,16 @@ def curve_functions(curve: Curve, name: str) -> tuple[Any, Any]:
         Position and first derivative, each (1) -> (3).
     """
     ca = load_casadi()
+    s = ca.MX.sym("s")
+    inside = ca.fmin(ca.fmax(s, 0.0), curve.length_m)
 
-    def function(spline: BSpline, name: str) -> Any:
-        s = ca.MX.sym("s")
+    def value(spline: BSpline) -> Any:
         coefficients = spline.c[: len(spline.t) - spline.k - 1]
-        value = ca.bspline(s, ca.DM(coefficients.ravel()), [spline.t.tolist()], [spline.k], 3, {})
-        return ca.Function(name, [s], [value])
+        return ca.bspline(inside, ca.DM(coefficients.ravel()), [spline.t.tolist()], [spline.k], 3, {})
 
-    return function(curve.spline, name), function(curve.spline.derivative(), f"{name}_tangent")
+    tangent = value(curve.spline.derivative())
+    position = value(curve.spline) + (s - inside) * tangent
+    return ca.Function(name, [s], [position]), ca.Function(f"{name}_tangent", [s], [tangent])
 
 
 def node_function(nozzle: NozzleCfg) -> Any:

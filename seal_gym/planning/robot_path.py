@@ -47,9 +47,7 @@ class RobotLimitsCfg:
         for name in ("joint_rad_s", "joint_rad_s2"):
             value = getattr(self, name)
             require(
-                isinstance(value, tuple)
-                and len(value) == 6
-                and all(is_number(v) and v > 0.0 for v in value),
+                isinstance(value, tuple) and len(value) == 6 and all(is_number(v) and v > 0.0 for v in value),
                 f"RobotLimitsCfg.{name} = {value!r}: must be 6 positive numbers",
                 ConfigError,
             )
@@ -110,8 +108,8 @@ def joint_path(path: BeadPath, T_base_part: Array, limits: RobotLimitsCfg) -> Ar
     if best is None:
         share = 100.0 * reached.mean(axis=0).max()
         raise PlanningError(
-            f"the robot cannot follow the path: the best branch reaches {share:.0f} % of its poses, or a joint "
-            "leaves its range: place the part elsewhere (see robot_path.place)"
+            f"the robot cannot follow the path: the best branch reaches {share:.0f} % of its poses, or "
+            "a joint leaves its range: place the part elsewhere (see robot_path.place)"
         )
     return np.asarray(best)
 
@@ -240,9 +238,7 @@ def robot_path(path: BeadPath, T_base_part: Array, limits: RobotLimitsCfg | None
     pose = np.linalg.inv(T_base_part) @ tip_kinematics(angles, speeds).pose
     flow = np.interp(tau, path.time_s, path.flow_m3_per_s) * rate
     return RobotPath(
-        path=BeadPath(
-            time_s=time, position_m=pose[:, :3, 3], rotation=pose[:, :3, :3], flow_m3_per_s=flow
-        ),
+        path=BeadPath(time_s=time, position_m=pose[:, :3, 3], rotation=pose[:, :3, :3], flow_m3_per_s=flow),
         q=angles,
         qd=speeds,
         planned_s=tau,
