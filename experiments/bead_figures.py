@@ -1,5 +1,6 @@
 """Figures of bead paths: the nozzle over the edges in space, and the parameters the thesis plots."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from seal_gym.planning.robot_path import RobotPath
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt  # the backend has to be chosen first
+from matplotlib.ticker import MaxNLocator
 
 _LEFT, _RIGHT, _NOZZLE, _NAIVE = "#0072b2", "#d55e00", "#222222", "#999999"
 _FANS = 60
+_MOST_SPREAD = 10.0  # where a border of the fan all but stands still, the number itself means nothing
 _CLIP = 4.0  # heights above so many times the median leave the picture
 
 
@@ -36,20 +39,25 @@ def _fan(ax: Any, path: BeadPath, foot: Footprint) -> None:
     ax.plot(*p.T, color=_NOZZLE, lw=1.6, label="nozzle's mouth; strokes: its axis")
 
 
+def _named(name: str, value: float, _: object) -> str:
+    return f"{name} {value:.0f} mm"
+
+
 def _space(ax: Any, edges: Edges, title: str) -> None:
     share = np.linspace(0.0, 1.0, 600)
     for edge, colour, name in ((edges.left, _LEFT, "left edge"), (edges.right, _RIGHT, "right edge")):
         ax.plot(*(1e3 * edge(share * edge.length_m)).T, color=colour, lw=2.2, label=name)
-    ax.set_title(title, fontsize=11)
-    ax.set_xlabel("x [mm]")
-    ax.set_ylabel("y [mm]")
-    ax.set_zlabel("z [mm]")
-    ax.set_aspect("equal")
-    low, high = ax.get_ylim()
-    if high - low < 60.0:
-        ax.set_yticks([round(v) for v in np.linspace(low, high, 3)])
-    low, high = ax.get_zlim()
-    ax.set_zticks([round(v) for v in np.linspace(low, high, 3)])
+    ax.set_title(title, fontsize=11, y=0.96)
+    spans = [np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())]
+    for axis, span, name, end in zip((ax.xaxis, ax.yaxis, ax.zaxis), spans, "xyz", (1, 0, 1), strict=True):
+        axis.set_tick_params(labelsize=8, pad=1)
+        if span < 0.35 * max(spans):  # true to scale there is room for one tick
+            axis.set_ticks([round(float(axis.get_view_interval()[end]))])
+            axis.set_major_formatter(partial(_named, name))
+            continue
+        axis.set_major_locator(MaxNLocator(max(2, round(6 * span / max(spans))), steps=[1, 2, 5, 10]))
+        axis.set_label_text(f"{name} [mm]", fontsize=9)
+    ax.set_box_aspect(spans, zoom=1.1)
 
 
 def draw_paths(
@@ -75,7 +83,7 @@ def draw_paths(
     shown = [("naive: constant offset and speed", naive, naive_print)]
     if path is not None and foot is not None:
         shown.insert(0, ("optimal", path, foot))
-    figure = plt.figure(figsize=(7.0 * len(shown), 6.4), layout="constrained")
+    figure = plt.figure(figsize=(7.0 * len(shown), 5.6), layout="constrained")
     for k, (name, one, hits) in enumerate(shown):
         ax = figure.add_subplot(1, len(shown), k + 1, projection="3d", elev=32, azim=-62)
         _fan(ax, one, hits)
@@ -97,6 +105,8 @@ def percent(spread: float) -> str:
     Returns:
         In percent.
     """
+    if spread > _MOST_SPREAD:
+        return f"over {100 * _MOST_SPREAD:.0f} %"
     return f"{100 * spread:.2f} %" if spread < 0.1 else f"{100 * spread:.0f} %"
 
 
@@ -172,36 +182,44 @@ def draw_parameters(
     ax.grid(alpha=0.3)
     ax.legend(fontsize=9, ncols=2)
 
+    _draw_robot(axes[3], robot, robot_print, mean)
+    figure.suptitle(f"Bead path: {case.title} (red dashes: limits)", fontsize=14)
+    figure.savefig(file, dpi=75)
+    plt.close(figure)
+
+
+def _draw_robot(axes: Any, robot: RobotPath, robot_print: Footprint, mean: float) -> None:
+    """The last row: rate, joint speeds and heights of the path as executed."""
     tau = robot.planned_s
-    ax = axes[3, 0]
+    ax = axes[0]
     ax.plot(tau, robot.rate, color=_NOZZLE, lw=1.6)
     ax.set_ylim(0.0, 1.05)
-    ax.set_title(f"UR5: rate, flow over planned flow (time x {robot.slow_down:.2f})", fontsize=11)
-    ax.set_ylabel("-")
-    ax = axes[3, 1]
+    ax.set_title(f"UR5: slowed by {robot.slow_down:.2f}", fontsize=11)
+    ax.set_ylabel("speed and flow over planned")
+    ax = axes[1]
     for joint, speeds in enumerate(robot.qd.T):
         ax.plot(tau, speeds, lw=1.2, label=f"joint {joint + 1}")
     ax.set_title("UR5: joint speeds", fontsize=11)
     ax.set_ylabel("rad/s")
     ax.legend(fontsize=8, ncols=3)
-    ax = axes[3, 2]
+    ax = axes[2]
     ax.plot(tau, 1e3 * robot_print.left_height_m, color=_LEFT, lw=2.6, label="left")
     ax.plot(tau, 1e3 * robot_print.right_height_m, color=_RIGHT, lw=1.2, label="right")
     ax.set_title(f"UR5: heights as executed, spread {percent(robot_print.spread)}", fontsize=11)
     ax.set_ylabel("mm")
     ax.legend(fontsize=9)
     ax.set_ylim(0.97 * mean, 1.03 * mean)
-    for ax in axes[3]:
+    for ax in axes:
         ax.set_xlabel("planned time [s]")
         ax.grid(alpha=0.3)
-    figure.suptitle(f"Bead path: {case.title} (red dashes: limits)", fontsize=14)
-    figure.savefig(file, dpi=75)
-    plt.close(figure)
 
 
 def _open_up(ax: Any) -> None:
     """Keeps a constant from looking like noise."""
     low, high = ax.get_ylim()
-    middle, least = (low + high) / 2, max(0.02 * abs(low + high) / 2, 0.1 if ax.get_ylabel() == "deg" else 0.0)
+    middle, least = (
+        (low + high) / 2,
+        max(0.02 * abs(low + high) / 2, 0.1 if ax.get_ylabel() == "deg" else 0.0),
+    )
     if high - low < 2 * least:
         ax.set_ylim(middle - least, middle + least)

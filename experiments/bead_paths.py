@@ -215,7 +215,7 @@ def markdown(rows: list[Row]) -> str:
             "height spread %",
             "as executed by the UR5 %",
             "slow-down",
-            "naive spread %",
+            "naive heights mm",
             "naive miss mm",
             "SLSQP CPU s",
             "SLSQP cost",
@@ -231,7 +231,7 @@ def markdown(rows: list[Row]) -> str:
                 number(r["ipopt_spread_pct"], 3),
                 number(r["robot_spread_pct"], 3),
                 number(r["slow_down"], 2),
-                number(r["naive_spread_pct"], 1),
+                f"{r['naive_height_min_mm']:.2f} to {r['naive_height_max_mm']:.2f}",
                 number(r["naive_miss_mm"], 2),
                 number(r["slsqp_cpu_s"], 2),
                 number(r["slsqp_cost"], 3),
@@ -245,12 +245,13 @@ def markdown(rows: list[Row]) -> str:
         f"- {r['case']}, SLSQP: {r['slsqp_word']}" for r in rows if r["slsqp_word"] not in ("", "solved")
     ]
     text = (
-        f"Height spread: (largest - smallest) / mean of the heights along both borders of the fan, on a grid "
+        "Height spread: (largest - smallest) / mean of the heights along both borders of the fan, on a grid "
         f"{FINER} times finer than the solver's, from rays followed to the surface, not from the constraint. "
-        "Miss: the largest distance of a border of the fan from its edge (below 0.01 mm for the optimal paths). "
-        "As executed: the same measure on the forward kinematics of the time-scaled joint path with the scaled "
-        f"flow. SLSQP: N = {SLSQP_INTERVALS} steps in time, nothing holds between them. CPU time of one core, "
-        "curves and CasADi loaded."
+        "As executed: the same measure on the forward kinematics of the time-scaled joint path with the "
+        "scaled flow, from rest to rest; slow-down: its time over the planned one. Naive: its smallest and "
+        "largest height by the same measure, and the largest distance of its fan's borders from the "
+        f"edges they should meet. SLSQP: N = {SLSQP_INTERVALS} steps in time, nothing holds between them. "
+        "CPU time of one core, curves and CasADi loaded."
     )
     return "\n\n".join((first, text, "\n".join(notes))).rstrip()
 

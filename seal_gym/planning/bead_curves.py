@@ -204,7 +204,10 @@ class Edges:
         """
         edges = cls(Curve.smoothed(left, spread_m), Curve.smoothed(right, spread_m))
         k = np.linspace(0.0, 1.0, 200)
-        width = np.linalg.norm(edges.chord(k), axis=1)
+        chord = edges.chord(k)
+        width = np.linalg.norm(chord, axis=1)
+        crossed = np.sum(chord[1:] * chord[:-1], axis=1) < 0.0  # between two samples
+        width[:-1][crossed] = 0.0
         require(
             bool(width.min() > 1e-4),
             f"edges: only {width.min() * 1e3:.3g} mm apart at {k[width.argmin()] * 100:.0f} % of their "

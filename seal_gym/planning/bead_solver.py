@@ -161,8 +161,9 @@ def solve(edges: Edges, duration_s: float, cfg: BeadCfg | None = None) -> BeadSo
     cfg = cfg or BeadCfg()
     check_duration(edges, duration_s)
     tilt = least_tilt(edges, cfg.nozzle.fan_angle_rad, cfg.tilt_rad)
-    if tilt is not None:
-        return _explain(edges, duration_s, cfg, tilt)
+    forbidden = _forbidden(edges, duration_s, cfg, tilt)
+    if forbidden is not None:
+        return forbidden
     guess = first_nodes(edges, duration_s, _FIRST_INTERVALS)
     iterations = 0
     for k in range(_ROUNDS):
@@ -173,7 +174,10 @@ def solve(edges: Edges, duration_s: float, cfg: BeadCfg | None = None) -> BeadSo
             smooth = replace(cfg, smoothing=_SMOOTHER * max(cfg.smoothing, 1e-6))
             found = solve_program(edges, duration_s, cfg, _nodes(edges, duration_s, smooth, guess))
         if not found.solved:
-            return _explain(edges, duration_s, cfg, None)
+            raise PlanningError(
+                f"IPOPT found neither a path nor a limit that forbids it ({found.status}): smooth the edges "
+                "more, raise BeadCfg.smoothing or change duration_s"
+            )
         finer = _refined(edges, found.nodes, cfg)
         if finer is None:
             return BeadSolution(
@@ -200,35 +204,21 @@ def _nodes(edges: Edges, duration_s: float, cfg: BeadCfg, guess: BeadNodes) -> B
     return found.nodes if found.solved else guess
 
 
-def _explain(edges: Edges, duration_s: float, cfg: BeadCfg, tilt: float | None) -> Infeasibility:
-    """Finds the limit that cannot be met, by the least slack with which a path exists.
+def _forbidden(edges: Edges, duration_s: float, cfg: BeadCfg, tilt: float | None) -> Infeasibility | None:
+    """The limit that cannot be met, by the least slack with which a path exists; None if it needs none.
 
     Args:
         edges: The edges.
         duration_s: t_f [s].
         cfg: Limits.
         tilt: A tilt proven too small [rad], if any.
-
-    Returns:
-        The limit, where and by how much.
-
-    Raises:
-        PlanningError: If the elastic program fails, or a path exists after all.
     """
-    guess = first_nodes(edges, duration_s, _ELASTIC_INTERVALS)
-    found = solve_program(edges, duration_s, cfg, guess, elastic=True)
-    if not found.solved:
-        raise PlanningError(
-            f"IPOPT found neither a path nor a limit that forbids it ({found.status}): smooth the "
-            "edges more or change duration_s"
-        )
+    found = solve_program(
+        edges, duration_s, cfg, first_nodes(edges, duration_s, _ELASTIC_INTERVALS), elastic=True
+    )
     name = max(found.slack, key=lambda group: float(found.slack[group].max()))
-    slack = found.slack[name]
-    if slack.max() < _FOUND:
-        raise PlanningError(
-            "the limits allow a path, but IPOPT did not converge to the best one: smooth the edges more "
-            "or raise BeadCfg.smoothing"
-        )
+    if not found.solved or found.slack[name].max() < _FOUND:
+        return None
     return _reason(edges, duration_s, cfg, found, name, tilt)
 
 
