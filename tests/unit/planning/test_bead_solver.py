@@ -243,3 +243,17 @@ def test_a_solver_that_gives_up_is_an_error(bend, monkeypatch):
     monkeypatch.setattr(bead_solver, "solve_program", stuck)
     with pytest.raises(PlanningError, match="neither a path nor a limit"):
         solve(bend, 0.4)
+
+
+def test_nodes_are_added_until_heights_hold_between_them(bend, monkeypatch):
+    monkeypatch.setattr(bead_solver, "_FIRST_INTERVALS", 12)
+    found = solve(bend, 0.4)
+    assert isinstance(found, BeadSolution)
+    assert found.rounds > 1
+    assert len(found.nodes.time_s) > 13
+    q = quantities(bend, found.nodes.finer(10), CFG)
+    heights = np.concatenate((q.g_m, q.h_m))
+    assert np.abs(heights - heights.mean()).max() < CFG.height_tolerance_m
+    monkeypatch.setattr(bead_solver, "_ROUNDS", 1)
+    with pytest.raises(PlanningError, match="between the nodes after 1 refinements"):
+        solve(bend, 0.4)
