@@ -101,6 +101,8 @@ def _large_square() -> BeadCase:
 
 
 def _small_square() -> BeadCase:
+    # The sharper its corners the shorter its outer edge against the inner one: up to a spread of 3 mm there
+    # still is a path, with the tilt at its limit nearly all the way round.
     left, right = _planar(_square(0.05), 10e-3, closed=True)
     return BeadCase(
         name="small_square",

@@ -101,8 +101,8 @@ def test_slsqp_and_ipopt_agree_on_the_cost(bend, solution):
     np.testing.assert_allclose(q.g_m, q.g_m[0], atol=CFG.height_tolerance_m)
 
 
-def test_no_perturbation_of_the_optimum_costs_less(bend):
-    # Without smoothing: sideways moves along the equal-height manifold, built by hand on a straight bead.
+def test_no_perturbation_of_a_straight_bead_costs_less():
+    # Moves that keep the heights equal and constant, built by hand on a straight bead.
     straight = np.linspace(0.0, 0.1, 2)[:, None] * [1.0, 0.0, 0.0]
     aside = np.array([0.0, 7.5e-3, 0.0])
     edges = Edges.smoothed(straight + aside, straight - aside, 8e-3)
@@ -154,6 +154,19 @@ def test_more_tilt_than_the_proof_asks_for_makes_the_small_square_feasible():
     assert np.rad2deg(needed) == pytest.approx(30.9, abs=0.3)
     found = solve(edges, case.duration_s, replace(CFG, tilt_rad=needed + np.deg2rad(3.0)))
     assert isinstance(found, BeadSolution)
+
+
+def test_with_sharper_corners_the_small_square_has_a_path_just_as_the_proof_allows():
+    # The proof's bound is sharp: edges that it calls reachable by 0.3 % of their length have a path.
+    case = bead_cases.get("small_square")
+    edges = Edges.smoothed(case.left, case.right, 2e-3)
+    _, high = reachable_ends(edges, THETA, np.array([CFG.tilt_rad]))
+    assert 1.0 < high[0] / edges.right.length_m < 1.005
+    found = solve(edges, case.duration_s)
+    assert isinstance(found, BeadSolution)
+    tilt = np.rad2deg(np.abs(quantities(edges, found.nodes, CFG).tilt_rad))
+    assert np.median(tilt) > 29.0
+    assert tilt.max() < 30.01
 
 
 def test_reachable_ends_of_parallel_edges_by_hand():
