@@ -1,12 +1,13 @@
-"""How hard the gun is pressed: constant, as Zhou et al. had it, or regulated by speed, bend and the seen bead.
+"""How hard the gun is pressed: constant, as Zhou et al. had it, or regulated by motion and the seen bead.
 
 Zhou et al. (section 4.4): with a constant flow "the sealing gun deposits excess silicone sealant around the
-corner"; they propose to reduce the pressure where the bead is seen to become thicker. The regulator does so in
-two parts. Feed-forward: the wanted section times the speed of its centroid along the seam, which by Pappus'
-theorem is the flow that fills it, in bends too; the nozzle's law gives the pressure, the line's lag is led.
+corner"; they propose to reduce the pressure where the bead is seen to become thicker. The regulator does so
+in two parts. Feed-forward: the wanted section times the speed of its centroid along the seam, by Pappus'
+theorem the flow that fills it, in bends too; the nozzle's law gives the pressure, the line's lag is led.
 Feedback: a slow integral of the bead's width behind the nozzle, because no cartridge is as thick as another.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -148,7 +149,10 @@ class PressureRegulator:
         return np.asarray(2.0 * command / self._most - 1.0)
 
 
-PRESSURES = {"regulated": PressureRegulator, "constant": ConstantPressure}
+PRESSURES: dict[str, Callable[[CellCfg, SealantCfg], Pressure]] = {
+    "regulated": PressureRegulator,
+    "constant": ConstantPressure,
+}
 
 
 class WithPressure:
@@ -191,8 +195,8 @@ class WithPressure:
         rows = np.atleast_2d(np.asarray(features, dtype=np.float64))
         require(
             rows.shape[1] == FEATURES + 3,
-            f"observation has shape {np.shape(features)}: needs {FEATURES + 3} entries; make the environment with "
-            "sealant=True",
+            f"observation has shape {np.shape(features)}: needs {FEATURES + 3} entries; make the environment "
+            "with sealant=True",
         )
         moved = features[..., :FEATURES]
         seen = {**observation, "features": moved} if isinstance(observation, dict) else moved

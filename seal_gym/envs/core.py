@@ -11,8 +11,8 @@ from seal_gym.core.errors import ActionError, ConfigError
 from seal_gym.core.frames import Array, axis_angle, cross, tip_rotation, transform, yaw_pose
 from seal_gym.core.kinematics import TipKinematics, tip_kinematics
 from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, check_leaf_function, make_adapter
-from seal_gym.envs import extrusion
 from seal_gym.envs.config import SealCfg
+from seal_gym.envs.extrusion import ROWS as SEALANT_ROWS
 from seal_gym.envs.extrusion import Extrusion
 from seal_gym.envs.sensors import Sensors
 from seal_gym.estimation.seam_rate import SeamRate
@@ -149,8 +149,8 @@ class SealCore:
         self._vision = self._eyes() if cfg.perception == "vision" else None
         self._lower, self._upper = _LOWER, _BOUND
         if self.extrusion is not None:
-            self._lower = np.concatenate((_LOWER, np.zeros(len(extrusion.ROWS))))
-            self._upper = np.concatenate((_BOUND, [bound for _, _, bound in extrusion.ROWS]))
+            self._lower = np.concatenate((_LOWER, np.zeros(len(SEALANT_ROWS))))
+            self._upper = np.concatenate((_BOUND, [bound for _, _, bound in SEALANT_ROWS]))
             if self._vision is not None:
                 self.extrusion.watch(self.sensors.nozzle[1])
         self._lean_taught = float(np.arctan2(self._start[2, 0], self._start[2, 2]))

@@ -86,7 +86,9 @@ class Extrusion:
         self._s = s.copy()
 
     def reward(self) -> Array:
-        """The bead's term of the reward: -``SealantCfg.reward`` |section / wanted - 1|, at most 1, behind the tip.
+        """The bead's term of the reward: -``SealantCfg.reward`` times its relative error behind the tip.
+
+        The error is |section / wanted - 1|, at most 1.
 
         Returns:
             Shape (N,).
@@ -138,7 +140,10 @@ class Extrusion:
             Shape (N, 3).
         """
         values = (self.bead.line.pressure_pa, self.width.width_m, self.width.seen)
-        scaled = [np.minimum(s * v, bound) for (_, s, bound), v in zip(ROWS, values, strict=True)]
+        scaled = [
+            np.minimum(s * np.asarray(v, np.float64), bound)
+            for (_, s, bound), v in zip(ROWS, values, strict=True)
+        ]
         return np.stack(scaled, axis=1)
 
     def view(self) -> BeadView:
@@ -149,7 +154,8 @@ class Extrusion:
         """
         bead, (behind, ahead) = self.bead, _IN_VIEW_M
         arc = bead.strip.arc
-        window = np.stack((np.searchsorted(arc, self._s - behind), np.searchsorted(arc, self._s + ahead)), axis=1)
+        ends = (np.searchsorted(arc, self._s - behind), np.searchsorted(arc, self._s + ahead))
+        window = np.stack(ends, axis=1)
         return BeadView(bead.strip, bead.height, window.astype(np.int64), np.array(self.cfg.fluid.rgb))
 
     def metrics(self, i: int) -> dict[str, float]:
@@ -170,9 +176,9 @@ class Extrusion:
             i: Which simulation.
 
         Returns:
-            ``pressure_kpa`` and ``flow_mm3_s`` at the nozzle; ``bead_width_mm`` and ``bead_seen`` as observed;
-            ``bead_section_pct``: the true section behind the tip, relative to the wanted one (NaN before the
-            seam's start), for metrics, not for policies.
+            ``pressure_kpa`` and ``flow_mm3_s`` at the nozzle; ``bead_width_mm`` and ``bead_seen`` as
+            observed; ``bead_section_pct``: the true section behind the tip, relative to the wanted one (NaN
+            before the seam's start), for metrics, not for policies.
         """
         line = self.bead.line
         return {

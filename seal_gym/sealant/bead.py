@@ -270,6 +270,24 @@ class Bead:
             ends.append(across[inner] + share * (across[outer] - across[inner]))
         return float(ends[1] - ends[0])
 
+    def spine(self, i: int, step_m: float) -> tuple[Array, Array]:
+        """A chain through the middle of one bead, for pictures.
+
+        Args:
+            i: Which simulation.
+            step_m: Between its points [m].
+
+        Returns:
+            Points in the part's frame, shape (K, 3), m, and the radii of round sections of the bead's size,
+            shape (K,), m; 0 where it is dry.
+        """
+        stride = max(round(step_m / self._spacing), 1)
+        volume, height = self.volume[i, ::stride], self.height[i, ::stride]
+        total = volume.sum(axis=1)
+        share = np.divide(volume, total[:, None], out=np.zeros_like(volume), where=total[:, None] > 0)
+        tops = self.strip.base[::stride] + 0.5 * height[..., None] * self.strip.column[::stride, None]
+        return (share[..., None] * tops).sum(axis=1), np.sqrt(total / self._spacing / np.pi)
+
     def section_share(self, i: int, s: float, span_m: float) -> float:
         """How much of the wanted bead lies on a stretch of the seam.
 
@@ -299,8 +317,8 @@ class Bead:
         Returns:
             ``bead_mm3`` on the part, ``sealant_mm3`` that left the nozzle and ``missed_mm3`` of it beside the
             part; means ``bead_width_mm`` and ``bead_height_mm``; ``bead_section_pct``, the mean section, and
-            ``bead_rmse_pct``, its root mean square departure, of the wanted one; ``gaps_pct`` of the arc; with
-            corners ``corner_section_pct``, the mean section there.
+            ``bead_rmse_pct``, its root mean square departure, of the wanted one; ``gaps_pct`` of the arc;
+            with corners ``corner_section_pct``, the mean section there.
         """
         p = self.profile(i)
         share = p.section / p.wanted

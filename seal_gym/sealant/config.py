@@ -14,8 +14,8 @@ class SealantCfg:
         sealant: A name (see ``SEALANTS``) or a ``Sealant``.
         gun: Nozzle, valve and line.
         section_mm2: Wanted section of the bead on a straight seam [mm^2]; around bends the same profile.
-        variation: Half the range, relative, of yield stress and consistency from run to run: a cartridge is never
-            the same twice, and the policy is not told.
+        variation: Half the range, relative, of yield stress and consistency from run to run: a cartridge is
+            never the same twice, and the policy is not told.
         reward: Weight of the bead's term in the reward; 0: none.
         spacing_m: Between the columns of the bead's grid [m].
         half_width_m: How far the grid reaches to either side of the seam [m].
@@ -32,9 +32,7 @@ class SealantCfg:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         object.__setattr__(self, "sealant", get_sealant(self.sealant))
-        require(
-            isinstance(self.gun, GunCfg), f"SealantCfg.gun = {self.gun!r}: must be a GunCfg"
-        )
+        require(isinstance(self.gun, GunCfg), f"SealantCfg.gun = {self.gun!r}: must be a GunCfg")
         for name, low, high in (
             ("section_mm2", 0.5, 40.0),
             ("variation", 0.0, 0.9),

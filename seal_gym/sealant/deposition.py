@@ -13,8 +13,8 @@ from seal_gym.core.frames import Array
 from seal_gym.core.jit import kernel
 from seal_gym.sealant.strip import Strip
 
-# Curvature of the dome's sides against the surface: over a plate they fall by a gap of 3 mm within 1.5 mm, as a
-# half round of that gap does.
+# Curvature of the dome's sides against the surface: over a plate they fall by a gap of 3 mm within 1.5 mm, as
+# a half round of that gap does.
 _SIDE_M = 0.4e-3
 REACH_M = 5e-3
 _WIDEST_M = 4e-3
@@ -37,14 +37,15 @@ def column_height(area: float, spread: float, volume: float) -> float:
         Metres.
     """
     root = np.sqrt(max(area * area + 4.0 * spread * volume, 0.0))
-    return float(2.0 * volume / (area + root))
+    out: float = 2.0 * volume / (area + root)
+    return out
 
 
 @kernel
 def _room(size: float, count: int, cells: Array, gain: Array) -> float:
     """Volume between the surface and a dome; ``gain`` gets each cell's.
 
-    ``size`` is the dome's height over the mouth's plane, or if positive the radius of its plateau in that plane.
+    ``size`` is the dome's height over the mouth's plane, or if positive the radius of its plateau there.
     """
     total = 0.0
     plateau, top = max(size, 0.0), min(size, 0.0)
@@ -105,10 +106,10 @@ def _gather(
 def _dome(amount: float, lowest: float, count: int, cells: Array, gain: Array) -> float:
     """Finds the dome that holds an amount, by false position within a bracket; returns what it holds."""
     low, high = lowest, _WIDEST_M
-    under, over = -amount, _room(high, count, cells, gain) - amount
+    under, over = -amount, float(_room(high, count, cells, gain) - amount)
     if over <= 0.0:
         return over + amount
-    total = over + amount
+    total: float = over + amount
     for step in range(_SEARCHES):
         # Every third step halves, so that a strongly bent function cannot stall the search.
         middle = 0.5 * (low + high) if step % 3 == 2 else (low * over - high * under) / (over - under)

@@ -15,7 +15,9 @@ _PAIR_SHARE = 0.2
 
 
 @kernel
-def _flux(thick: float, slope: float, weight: float, yield_stress: float, consistency: float, m: float) -> float:
+def _flux(
+    thick: float, slope: float, weight: float, yield_stress: float, consistency: float, m: float
+) -> float:
     """Flow per width of a layer on a slope, m^2/s; m = 1 / n.
 
     With the sheared part Y = max(0, h - tau_y / (rho g S)) and the flow index n:
@@ -69,7 +71,7 @@ def _slope_along(strip: Strip, head: Array, first: int, k: int, j: int) -> float
 
 
 @kernel
-def level(
+def level(  # noqa: PLR0912  # one pass over pairs of neighbours
     strip: Strip,
     volume: Array,
     height: Array,
@@ -129,9 +131,8 @@ def level(
                     side = strip.area[gk, gj] / pitch
                 else:
                     gap = strip.gap_along[k, j]
-                    other = 0.5 * (
-                        _slope_across(strip, head, k, j, k - first) + _slope_across(strip, head, r, c, r - first)
-                    )
+                    other = _slope_across(strip, head, k, j, k - first)
+                    other = 0.5 * (other + _slope_across(strip, head, r, c, r - first))
                     side = strip.gap_across[gk, gj] if gj + 1 < columns else strip.gap_across[gk, gj - 1]
                 own = fall / gap
                 slope = np.sqrt(own * own + other * other)

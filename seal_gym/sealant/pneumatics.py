@@ -1,4 +1,4 @@
-"""From the commanded air pressure to the sealant's flow: valve and line, then a yield-stress fluid in a tube."""
+"""From the commanded air pressure to the sealant's flow: valve and line, then a paste in a tube."""
 
 from dataclasses import dataclass, fields
 
@@ -48,13 +48,13 @@ class Sealant:
                 f"Sealant.{name} = {value!r}: must be a number in {low:g}..{high:g}",
             )
         require(
-            len(self.rgb) == 3 and all(is_number(c) and 0.0 <= c <= 1.0 for c in self.rgb),
+            np.shape(self.rgb) == (3,) and all(0.0 <= c <= 1.0 for c in self.rgb),
             f"Sealant.rgb = {self.rgb!r}: must be 3 numbers in 0..1",
         )
 
 
-# Within the ranges usual for one-component sealants (yield stress 100-500 Pa, K 50-600 Pa s^n, n 0.3-0.5); the
-# self-levelling one runs, as a contrast. No primary table is behind the single values: vary them.
+# Within the ranges usual for one-component sealants (yield stress 100-500 Pa, K 50-600 Pa s^n, n 0.3-0.5);
+# the self-levelling one runs, as a contrast. No primary table is behind the single values: vary them.
 SEALANTS = {
     s.name: s
     for s in (
@@ -130,9 +130,9 @@ class GunCfg:
         highest = {"bore_m": 0.02, "length_m": 1.0, "pressure_max_pa": 2e6, "lag_s": 5.0}
         for f in fields(self):
             value, high = getattr(self, f.name), highest[f.name]
-            low_ok = is_number(value) and (value > 0 or (f.name == "lag_s" and value == 0))
+            positive = is_number(value) and (value > 0 or (f.name == "lag_s" and value == 0))
             require(
-                low_ok and value <= high,
+                positive and value <= high,
                 f"GunCfg.{f.name} = {value!r}: must be a number above 0 and at most {high:g}; check the unit",
             )
 
@@ -235,12 +235,12 @@ class PressureLine:
         """
         command = np.clip(command_pa, 0.0, self._gun.pressure_max_pa)
         gap = self.pressure_pa - command
-        times = 0.5 * dt_s * (1.0 + _NODES)
+        times = np.append(0.5 * dt_s * (1.0 + _NODES), dt_s)
         pressure = command + gap * self._left(times)[:, None]
-        flow = tube_flow(pressure, *self._fluid, self._gun)
-        self.pressure_pa = command + gap * self._left(np.array([dt_s]))[0]
-        self.flow_m3_s = tube_flow(self.pressure_pa, *self._fluid, self._gun)
-        return np.asarray(0.5 * dt_s * (_WEIGHTS[:, None] * flow).sum(axis=0))
+        yield_stress, consistency, index = self._fluid
+        flow = tube_flow(pressure, yield_stress, consistency, index, self._gun)
+        self.pressure_pa, self.flow_m3_s = pressure[-1], flow[-1]
+        return np.asarray(0.5 * dt_s * (_WEIGHTS[:, None] * flow[:-1]).sum(axis=0))
 
     def _left(self, times: Array) -> Array:
         """Share of the old difference that is left after some times."""

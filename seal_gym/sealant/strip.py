@@ -1,7 +1,7 @@
 """The part's surface beside a seam as a grid of columns that sealant fills: the bead's coordinates.
 
-A column stands on the surface at an arc length s and an offset u to the right of travel, and points back along
-the nozzle's taught direction. In a fillet the columns' feet make a V, over a groove a notch.
+A column stands on the surface at an arc length s and an offset u to the right of travel, and points back
+along the nozzle's taught direction. In a fillet the columns' feet make a V, over a groove a notch.
 """
 
 from typing import NamedTuple, Self
@@ -33,8 +33,8 @@ class Strip(NamedTuple):
         spread: Half the growth of the section with height, shape (S, U), m.
         slant: Cosine between a column and the surface's normal: a layer of height h is h times this thick,
             shape (S, U).
-        gap_along: Distance between a foot and the next one along the seam, shape (S, U), m; 0 in the last row.
-        gap_across: Distance between a foot and the next one to the right, shape (S, U), m; 0 in the last column.
+        gap_along: Distance from a foot to the next one along the seam, shape (S, U), m; 0 in the last row.
+        gap_across: Distance from a foot to the next one to the right, shape (S, U), m; 0 in the last column.
         up: Unit vector against gravity, shape (3,).
     """
 
@@ -98,9 +98,7 @@ class Strip(NamedTuple):
         foot = np.where(there, height, 0.0)
         base = point[:, None] + across[:, None] * side[:, None] + foot[..., None] * column[:, None]
         # Lengths along the seam grow with the offset and the height as the frame turns: 1 + u x' t + h a' t.
-        turn_side, turn_column = (
-            np.sum(np.gradient(v, arc, axis=0) * along, axis=1) for v in (side, column)
-        )
+        turn_side, turn_column = (np.sum(np.gradient(v, arc, axis=0) * along, axis=1) for v in (side, column))
         stretch = np.sum(np.gradient(point, arc, axis=0) * along, axis=1)
         length = stretch[:, None] + across * turn_side[:, None] + foot * turn_column[:, None]
         length = np.maximum(length, _LEAST_SHARE)

@@ -1,4 +1,4 @@
-"""The columns that a bead fills, from the part's triangles: rays from along the nozzle's way down to the surface."""
+"""The columns that a bead fills: rays along the nozzle's direction down to the part's triangles."""
 
 from functools import lru_cache
 
@@ -9,8 +9,8 @@ from seal_gym.core.jit import kernel
 from seal_gym.sealant.strip import Strip
 from seal_gym.workpieces.workpiece import Workpiece
 
-# Rays begin this far over the seam, along the columns, and end this far below it: a groove's bottom is seen, the
-# far side of a thin plate is not.
+# Rays begin this far over the seam, along the columns, and end this far below it: a groove's bottom is seen,
+# the far side of a thin plate is not.
 _ABOVE_M, _BELOW_M = 18e-3, 8e-3
 
 
@@ -95,9 +95,9 @@ def bead_strip(workpiece: Workpiece, spacing_m: float, half_width_m: float) -> S
     """
     seam, surface = workpiece.seam, workpiece.surface
     first, last = float(seam.arc[0]), float(seam.arc[-1])
-    arc = np.linspace(first, last, max(int(round((last - first) / spacing_m)), 2) + 1)
-    half = max(int(round(half_width_m / spacing_m)), 1)
-    across = spacing_m * np.arange(-half, half + 1)
+    arc = np.linspace(first, last, max(round((last - first) / spacing_m), 2) + 1)
+    half = max(round(half_width_m / spacing_m), 1)
+    across = spacing_m * np.arange(-half, half + 1, dtype=np.float64)
     line = seam.at(arc)
     side = np.cross(line.tangent, line.approach)
     triangles = np.ascontiguousarray(surface.triangles, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The bead in the raycaster's pictures: its columns' tops as a shaded surface that fades out where it is thin."""
+"""The bead in the raycaster's pictures: its columns' tops, shaded, fading out where they are thin."""
 
 from typing import Any, NamedTuple, Self
 
@@ -38,110 +38,95 @@ class BeadView(NamedTuple):
             What ``draw_bead`` is not called for.
         """
         line, grid = np.zeros((0, 3)), np.zeros((0, 0))
-        strip = Strip(
-            np.zeros(0), np.zeros(0), np.zeros((0, 0, 3)), line, line, grid, grid, grid, grid, grid, np.zeros(3)
-        )
+        none = np.zeros(0)
+        strip = Strip(none, none, np.zeros((0, 0, 3)), line, line, grid, grid, grid, grid, grid, np.zeros(3))
         return cls(strip, np.zeros((0, 0, 0)), np.zeros((0, 2), np.int64), np.zeros(3))
 
 
 @kernel
-def _tops(
-    strip: Strip,
-    height: Array,
-    first: int,
-    last: int,
-    rot: Array,
-    eye: Array,
-    view: Any,
-    top: Array,
-    seen: Array,
-) -> None:
-    """The columns' tops: in the part's frame, and where the camera sees them (u, v in px, 1 / z)."""
-    left, upper = view.ray_x[0] * view.focal, view.ray_y[0] * view.focal
-    for k in range(first, last):
-        for j in range(strip.area.shape[1]):
-            offset, local = np.empty(3), np.empty(3)
-            for a in range(3):
-                top[k - first, j, a] = strip.base[k, j, a] + height[k, j] * strip.column[k, a]
-                offset[a] = top[k - first, j, a] - eye[a]
-            for a in range(3):
-                local[a] = rot[0, a] * offset[0] + rot[1, a] * offset[1] + rot[2, a] * offset[2]
-            z = max(local[2], _NEAR_M)
-            seen[k - first, j, 0] = local[0] / z * view.focal - left
-            seen[k - first, j, 1] = local[1] / z * view.focal - upper
-            seen[k - first, j, 2] = 1.0 / z if local[2] > _NEAR_M else 0.0
+def _top(strip: Strip, height: Array, k: int, j: int, rot: Array, eye: Array, view: Any, out: Array) -> None:
+    """One column's top: in the part's frame, then where the camera sees it (column, row [px], 1 / z)."""
+    x = strip.base[k, j, 0] + height[k, j] * strip.column[k, 0]
+    y = strip.base[k, j, 1] + height[k, j] * strip.column[k, 1]
+    z = strip.base[k, j, 2] + height[k, j] * strip.column[k, 2]
+    out[0], out[1], out[2] = x, y, z
+    x, y, z = x - eye[0], y - eye[1], z - eye[2]
+    depth = rot[0, 2] * x + rot[1, 2] * y + rot[2, 2] * z
+    out[5] = 0.0
+    if depth > _NEAR_M:
+        out[5] = 1.0 / depth
+        out[3] = ((rot[0, 0] * x + rot[1, 0] * y + rot[2, 0] * z) / depth - view.ray_x[0]) * view.focal
+        out[4] = ((rot[0, 1] * x + rot[1, 1] * y + rot[2, 1] * z) / depth - view.ray_y[0]) * view.focal
 
 
 @kernel
 def _light(top: Array, k: int, j: int, lamp: Array, ambient: float, diffuse: float) -> float:
     """Brightness of the surface at a column."""
-    rows, columns = top.shape[0], top.shape[1]
-    a, b = max(k - 1, 0), min(k + 1, rows - 1)
-    c, d = max(j - 1, 0), min(j + 1, columns - 1)
-    normal, square = np.empty(3), 0.0
-    for i in range(3):
-        m, n = (i + 1) % 3, (i + 2) % 3
-        # Right of travel times travel is the way back along the nozzle.
-        normal[i] = (top[k, d, m] - top[k, c, m]) * (top[b, j, n] - top[a, j, n])
-        normal[i] -= (top[k, d, n] - top[k, c, n]) * (top[b, j, m] - top[a, j, m])
-        square += normal[i] * normal[i]
-    cosine = 0.0
-    if square > 0.0:
-        for i in range(3):
-            cosine += normal[i] * lamp[i] / np.sqrt(square)
+    a, b = max(k - 1, 0), min(k + 1, top.shape[0] - 1)
+    c, d = max(j - 1, 0), min(j + 1, top.shape[1] - 1)
+    # Right of travel times travel is the way back along the nozzle.
+    rx, ry, rz = top[k, d, 0] - top[k, c, 0], top[k, d, 1] - top[k, c, 1], top[k, d, 2] - top[k, c, 2]
+    ax, ay, az = top[b, j, 0] - top[a, j, 0], top[b, j, 1] - top[a, j, 1], top[b, j, 2] - top[a, j, 2]
+    nx, ny, nz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+    square = nx * nx + ny * ny + nz * nz
+    if square <= 0.0:
+        return ambient
+    cosine = (nx * lamp[0] + ny * lamp[1] + nz * lamp[2]) / np.sqrt(square)
     return float(ambient + diffuse * max(cosine, 0.0))
 
 
 @kernel
 def _fill(
-    seen: Array,
-    shade: Array,
-    cover: Array,
-    corners: NDArray[np.int64],
+    top: Array,
+    a: tuple[int, int],
+    b: tuple[int, int],
+    c: tuple[int, int],
     near: Array,
-    layer_near: Array,
-    layer_shade: Array,
-    layer_cover: Array,
+    layer: Array,
 ) -> None:
     """One triangle of the bead into its layer: nearest wins, and what the part hides is not seen."""
     height, width = near.shape
-    x, y, w = np.empty(3), np.empty(3), np.empty(3)
-    for m in range(3):
-        x[m], y[m], w[m] = (
-            seen[corners[m, 0], corners[m, 1], 0],
-            seen[corners[m, 0], corners[m, 1], 1],
-            seen[corners[m, 0], corners[m, 1], 2],
-        )
-        if w[m] <= 0.0:
-            return
-    area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
-    if abs(area) < 1e-9:
+    wa, wb, wc = top[a[0], a[1], 5], top[b[0], b[1], 5], top[c[0], c[1], 5]
+    if min(wa, min(wb, wc)) <= 0.0:  # noqa: PLW3301 - two arguments are what numba inlines
         return
-    low_x, high_x = min(x[0], min(x[1], x[2])), max(x[0], max(x[1], x[2]))  # noqa: PLW3301 - for numba
-    low_y, high_y = min(y[0], min(y[1], y[2])), max(y[0], max(y[1], y[2]))  # noqa: PLW3301
-    if high_x < 0.0 or high_y < 0.0 or low_x > width - 1.0 or low_y > height - 1.0:
+    xa, xb, xc = top[a[0], a[1], 3], top[b[0], b[1], 3], top[c[0], c[1], 3]
+    ya, yb, yc = top[a[0], a[1], 4], top[b[0], b[1], 4], top[c[0], c[1], 4]
+    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+    low_x, high_x = min(xa, min(xb, xc)), max(xa, max(xb, xc))  # noqa: PLW3301
+    low_y, high_y = min(ya, min(yb, yc)), max(ya, max(yb, yc))  # noqa: PLW3301
+    if abs(area) < 1e-9 or high_x < 0.0 or high_y < 0.0 or low_x > width - 1.0 or low_y > height - 1.0:
         return
     for i in range(max(int(np.ceil(low_y)), 0), min(int(high_y) + 1, height)):
         for j in range(max(int(np.ceil(low_x)), 0), min(int(high_x) + 1, width)):
-            b = ((j - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (i - y[0])) / area
-            c = ((x[1] - x[0]) * (i - y[0]) - (j - x[0]) * (y[1] - y[0])) / area
-            a = 1.0 - b - c
-            if a < 0.0 or b < 0.0 or c < 0.0:
+            sb = ((j - xa) * (yc - ya) - (xc - xa) * (i - ya)) / area
+            sc = ((xb - xa) * (i - ya) - (j - xa) * (yb - ya)) / area
+            sa = 1.0 - sb - sc
+            if min(sa, min(sb, sc)) < 0.0:  # noqa: PLW3301
                 continue
-            depth = a * w[0] + b * w[1] + c * w[2]
+            depth = sa * wa + sb * wb + sc * wc
             # Half a percent of slack: a film lies as far away as the part under it.
-            if depth < 0.995 * near[i, j] or depth <= layer_near[i, j]:
+            if depth < 0.995 * near[i, j] or depth <= layer[i, j, 0]:
                 continue
-            layer_near[i, j] = depth
-            bright, opaque = 0.0, 0.0
-            for m, share in enumerate((a, b, c)):
-                bright += share * shade[corners[m, 0], corners[m, 1]]
-                opaque += share * cover[corners[m, 0], corners[m, 1]]
-            layer_shade[i, j], layer_cover[i, j] = bright, min(opaque, 1.0)
+            layer[i, j, 0] = depth
+            for m in (1, 2):
+                layer[i, j, m] = (
+                    sa * top[a[0], a[1], 5 + m] + sb * top[b[0], b[1], 5 + m] + sc * top[c[0], c[1], 5 + m]
+                )
 
 
 @kernel
-def draw_bead(
+def _wet_columns(height: Array, first: int, last: int) -> tuple[int, int]:
+    """First and last + 1 of the columns with sealant, and their dry neighbours."""
+    left, right = height.shape[1], 0
+    for k in range(first, last):
+        for j in range(height.shape[1]):
+            if height[k, j] > 0.0:
+                left, right = min(left, j), max(right, j + 1)
+    return max(left - 1, 0), min(right + 1, height.shape[1])
+
+
+@kernel
+def draw_bead(  # noqa: PLR0912  # loops over rows and columns
     bead: BeadView,
     row: int,
     rot: Array,
@@ -167,7 +152,6 @@ def draw_bead(
     """
     strip, height = bead.strip, bead.height[row]
     first, last = bead.window[row, 0], bead.window[row, 1]
-    columns = strip.area.shape[1]
     while first < last and height[first].max() <= 0.0:
         first += 1
     while last > first and height[last - 1].max() <= 0.0:
@@ -175,34 +159,26 @@ def draw_bead(
     first, last = max(first - 1, 0), min(last + 1, len(strip.arc))
     if last - first < 3:
         return
-    rows = last - first
-    top, seen = np.empty((rows, columns, 3)), np.empty((rows, columns, 3))
-    shade, cover = np.zeros((rows, columns)), np.zeros((rows, columns))
-    _tops(strip, height, first, last, rot, eye, view, top, seen)
+    left, right = _wet_columns(height, first, last)
+    rows, columns = last - first, right - left
+    top = np.empty((rows, columns, 8))  # point, pixel, 1 / z, brightness, cover
     for k in range(rows):
         for j in range(columns):
-            if height[first + k, j] > 0.0:
-                cover[k, j] = height[first + k, j] / _OPAQUE_M
-            wet = height[first + k, max(j - 1, 0)] + height[first + k, min(j + 1, columns - 1)]
-            wet += height[max(first + k - 1, 0), j] + height[min(first + k + 1, len(strip.arc) - 1), j]
-            if wet + height[first + k, j] > 0.0:
-                shade[k, j] = _light(top, k, j, lamp, look.ambient[row], look.diffuse[row])
-    shape = near.shape
-    layer_near, layer_shade, layer_cover = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    corners = np.empty((3, 2), np.int64)
+            _top(strip, height, first + k, left + j, rot, eye, view, top[k, j])
+            top[k, j, 7] = height[first + k, left + j] / _OPAQUE_M
+    for k in range(rows):
+        for j in range(columns):
+            top[k, j, 6] = _light(top, k, j, lamp, look.ambient[row], look.diffuse[row])
+    layer = np.zeros((near.shape[0], near.shape[1], 3))  # 1 / z, brightness, cover
     for k in range(rows - 1):
         for j in range(columns - 1):
-            if cover[k, j] + cover[k + 1, j] + cover[k, j + 1] + cover[k + 1, j + 1] <= 0.0:
-                continue
-            for half in range(2):
-                corners[0, 0], corners[0, 1] = k, j
-                corners[1, 0], corners[1, 1] = k + half, j + 1
-                corners[2, 0], corners[2, 1] = k + 1, j + 1 - half
-                _fill(seen, shade, cover, corners, near, layer_near, layer_shade, layer_cover)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            a = layer_cover[i, j]
-            if a > 0.0:
+            if top[k, j, 7] + top[k + 1, j, 7] + top[k, j + 1, 7] + top[k + 1, j + 1, 7] > 0.0:
+                _fill(top, (k, j), (k, j + 1), (k + 1, j + 1), near, layer)
+                _fill(top, (k, j), (k + 1, j + 1), (k + 1, j), near, layer)
+    for i in range(near.shape[0]):
+        for j in range(near.shape[1]):
+            cover = min(layer[i, j, 2], 1.0)
+            if cover > 0.0:
                 for c in range(3):
                     below = picture[i, 3 * j + c]
-                    picture[i, 3 * j + c] = below + a * (255.0 * bead.rgb[c] * layer_shade[i, j] - below)
+                    picture[i, 3 * j + c] = below + cover * (255.0 * bead.rgb[c] * layer[i, j, 1] - below)

@@ -1,7 +1,7 @@
 """The fresh bead in the two views: hidden from the seam's tracker, measured behind the nozzle.
 
-Plate and wall are grey, so the differences between their colour channels are near zero whatever the exposure; a
-coloured sealant's are not.
+Plate and wall are grey, so the differences between their colour channels are near zero whatever the exposure;
+a coloured sealant's are not.
 """
 
 from typing import NamedTuple
@@ -50,8 +50,8 @@ def colour_weights(rgb: tuple[float, float, float]) -> Array:
     size = float(np.sqrt((opponent**2).sum()))
     require(
         size >= _MIN_OPPONENT,
-        f"sealant of colour {tuple(rgb)}: its channels differ by {size:.2f}, at least {_MIN_OPPONENT} is needed "
-        "to tell it from plate and wall; dye it (Sealant.rgb), or use perception='oracle'",
+        f"sealant of colour {tuple(rgb)}: its channels differ by {size:.2f}, at least {_MIN_OPPONENT} is "
+        "needed to tell it from plate and wall; dye it (Sealant.rgb), or use perception='oracle'",
     )
     way = opponent / size
     return np.array([way[0], way[1] - way[0], -way[1]])
@@ -92,9 +92,56 @@ def hide_sealant(
         _hide(images[n], weights, view, masks[n])
 
 
+@kernel
+def _span(signal: Array) -> float:
+    """Extent of what exceeds half the signal's peak, with interpolated ends [px]; NaN if none or cut off."""
+    peak = signal.max()
+    if peak <= _MIN_CONTRAST:
+        return np.nan
+    half, first, last = 0.5 * peak, -1, -1
+    for i in range(len(signal)):
+        if signal[i] > half:
+            first = i if first < 0 else first
+            last = i
+    if first == 0 or last == len(signal) - 1:
+        return np.nan
+    low = (signal[first] - half) / (signal[first] - signal[first - 1])
+    high = (signal[last] - half) / (signal[last] - signal[last + 1])
+    return float(last - first + low + high)
+
+
+@kernel
+def _measure(
+    side: NDArray[np.uint8],
+    weights: Array,
+    columns: NDArray[np.int64],
+    clear: NDArray[np.bool_],
+    px_per_m: float,
+    width: Array,
+    seen: NDArray[np.bool_],
+) -> None:
+    """The median of the pixel columns' spans, if most of them have one."""
+    signal, spans = np.empty(side.shape[1]), np.empty(len(columns))
+    for n in range(len(side)):
+        found = 0
+        for m in range(len(columns)):
+            for i in range(len(signal)):
+                signal[i] = 0.0
+                if clear[i, m]:
+                    for c in range(3):
+                        signal[i] += weights[c] * side[n, i, columns[m], c]
+            span = _span(signal)
+            if not np.isnan(span):
+                spans[found] = span
+                found += 1
+        seen[n] = 2 * found > len(columns)
+        width[n] = np.median(spans[:found]) / px_per_m if seen[n] else 0.0
+
+
 class BeadGauge:
-    """Measures beads in side views: along a column of pixels behind the nozzle, where the sealant's signal exceeds
-    half its highest.
+    """Measures beads in side views.
+
+    Along a column of pixels behind the nozzle, the bead is where the sealant's signal exceeds half its peak.
 
     Args:
         camera: The side view.
@@ -106,9 +153,9 @@ class BeadGauge:
         self._weights = colour_weights(rgb)
         pixel = camera.project(np.array([[0.0, -b, 0.0] for b in BEHIND_M]))[:, 0]
         low, high = (int(np.clip(x, 0, camera.width - 1)) for x in (pixel.min(), pixel.max()))
-        columns = np.arange(low, max(high, low + 1))
+        columns = np.arange(low, max(high, low + 1), dtype=np.int64)
         clear = nozzle[:, columns] <= _HIDDEN
-        self._columns, self._clear = columns, clear
+        self._columns, self._clear = columns, np.ascontiguousarray(clear)
         # Along a row of the seam's frame the view's vertical is mostly x: px per metre across.
         step = camera.project(np.array([[0.0, -BEHIND_M[1], 0.0], [1e-3, -BEHIND_M[1], 0.0]]))
         self._px_per_m = 1e3 * float(np.abs(step[1, 1] - step[0, 1]))
@@ -122,28 +169,8 @@ class BeadGauge:
         Returns:
             Widths: the median over the pixel columns behind the nozzle.
         """
-        strip = side[:, :, self._columns].astype(np.float64)
-        signal = np.where(self._clear, (strip * self._weights).sum(axis=-1), 0.0)
-        peak = signal.max(axis=1)  # (N, columns)
-        half = 0.5 * peak[:, None]
-        inside = signal > half
-        first = inside.argmax(axis=1)
-        last = signal.shape[1] - 1 - inside[:, ::-1].argmax(axis=1)
-        span = _edge(signal, half, last, +1) - _edge(signal, half, first, -1)
-        usable = (peak > _MIN_CONTRAST) & (first > 0) & (last < signal.shape[1] - 1)
-        seen = usable.sum(axis=1) * 2 > usable.shape[1]
-        masked = np.where(usable, span, np.nan)
-        width = np.zeros(len(side))
-        if seen.any():
-            width[seen] = np.nanmedian(masked[seen], axis=1) / self._px_per_m
+        width, seen = np.empty(len(side)), np.empty(len(side), np.bool_)
+        _measure(
+            np.ascontiguousarray(side), self._weights, self._columns, self._clear, self._px_per_m, width, seen
+        )
         return BeadWidth(width, seen)
-
-
-def _edge(signal: Array, half: Array, at: NDArray[np.intp], step: int) -> Array:
-    """Where the signal falls through the level just outside a pixel, in pixels, by interpolation."""
-    rows = signal.shape[1]
-    beyond = np.clip(at + step, 0, rows - 1)
-    inner = np.take_along_axis(signal, at[:, None], axis=1)[:, 0]
-    outer = np.take_along_axis(signal, beyond[:, None], axis=1)[:, 0]
-    drop = np.maximum(inner - outer, 1e-9)
-    return np.asarray(at + step * np.clip((inner - half[:, 0]) / drop, 0.0, 1.0))

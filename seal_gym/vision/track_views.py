@@ -304,7 +304,7 @@ def _kalman(variance: Array, k: int, drift: float, error: float, noise: float, g
 
 
 @kernel
-def track_side(
+def track_side(  # noqa: PLR0911  # each return is a reason not to have seen the seam
     i: int,
     mask: Bools,
     g: ViewGeometry,

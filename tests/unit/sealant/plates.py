@@ -7,8 +7,8 @@ from seal_gym.sealant.strip import Strip
 
 def plate(length=0.06, half=10e-3, spacing=0.5e-3, tilt_rad=0.0):
     """A flat strip that rises to the right of travel by ``tilt_rad``; columns stand on it."""
-    arc = np.linspace(0, length, int(round(length / spacing)) + 1)
-    n = int(round(half / spacing))
+    arc = np.linspace(0, length, round(length / spacing) + 1)
+    n = round(half / spacing)
     across = spacing * np.arange(-n, n + 1)
     c, s = np.cos(tilt_rad), np.sin(tilt_rad)
     right, normal = np.array([c, 0.0, s]), np.array([-s, 0.0, c])

@@ -34,7 +34,8 @@ def test_a_still_nozzle_makes_a_paraboloid():
     volume, height = np.zeros((1, *strip.area.shape)), np.zeros((1, *strip.area.shape))
     tip = np.array([[0.0, 0.01, 6e-3]])
     amount, missed = np.array([6e-9]), np.zeros(1)
-    _lay_rows(strip, volume, height, amount, tip, tip, np.eye(3)[None], STIFF, 1 / 30, missed, np.array([[0, 81]]), 0, 1)
+    window = np.array([[0, 81]])
+    _lay_rows(strip, volume, height, amount, tip, tip, np.eye(3)[None], STIFF, 1 / 30, missed, window, 0, 1)
     # z = h0 - r^2 / (2 c) holds pi c h0^2.
     assert height.max() == pytest.approx(np.sqrt(6e-9 / (np.pi * _SIDE_M)), rel=0.02)
     assert volume.sum() == pytest.approx(6e-9, rel=1e-12)

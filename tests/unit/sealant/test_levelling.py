@@ -21,7 +21,8 @@ def test_flux_is_the_integral_of_the_velocity_profile(index, thick, slope):
     sheared = max(thick - yield_stress / (WEIGHT * slope), 0.0)
     expected = quad(lambda z: rate(z) * (thick - z), 0, sheared, epsabs=0, epsrel=1e-11)[0]
     assert expected > 0
-    assert _flux(thick, slope, WEIGHT, yield_stress, consistency, 1 / index) == pytest.approx(expected, rel=1e-9)
+    found = _flux(thick, slope, WEIGHT, yield_stress, consistency, 1 / index)
+    assert found == pytest.approx(expected, rel=1e-9)
 
 
 def run(strip, height, seconds, yield_stress, consistency=2.0, m=1.0, dt=1 / 30):

@@ -133,8 +133,6 @@ def test_bad_values_are_named(make, match):
 
 
 def test_a_sealant_of_ones_own_passes_through():
-    own = Sealant(
-        name="own", density_kg_m3=1e3, yield_stress_pa=10.0, consistency_pa_sn=5.0, flow_index=0.5
-    )
+    own = Sealant(name="own", density_kg_m3=1e3, yield_stress_pa=10.0, consistency_pa_sn=5.0, flow_index=0.5)
     assert get_sealant(own) is own
     assert get_sealant("polyurethane") is SEALANTS["polyurethane"]

@@ -13,7 +13,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def ring(radius, column, rows=721, across=None):
-    """A strip round a circle in the plane, travelled counter-clockwise: offsets to the right point outwards."""
+    """A strip round a circle, travelled counter-clockwise: offsets to the right point outwards."""
     arc = np.linspace(0, 2 * np.pi * radius, rows)
     angle = arc / radius
     out = np.column_stack((np.cos(angle), np.sin(angle), 0 * angle))
@@ -22,7 +22,8 @@ def ring(radius, column, rows=721, across=None):
     direction = up if column == "up" else out
     across = np.linspace(-4e-3, 4e-3, 17) if across is None else across
     flat = np.zeros((rows, len(across)))
-    return Strip.of(arc, across, (radius * out, along, direction), flat, np.broadcast_to(direction[:, None], (*flat.shape, 3)))
+    normal = np.broadcast_to(direction[:, None], (*flat.shape, 3))
+    return Strip.of(arc, across, (radius * out, along, direction), flat, normal)
 
 
 def test_columns_over_a_plane_fill_a_ring():
@@ -55,7 +56,8 @@ def test_feet_of_a_fillet_make_a_right_angle(name):
 
 
 def test_feet_of_a_groove_make_a_notch():
-    part = Workpiece.from_polyline([[-0.1, 0, 0], [0.1, 0, 0]], [0, 0, 1.0], joint="groove", groove_width=2e-3)
+    line = [[-0.1, 0, 0], [0.1, 0, 0]]
+    part = Workpiece.from_polyline(line, [0, 0, 1.0], joint="groove", groove_width=2e-3)
     strip = bead_strip(part, 0.25e-3, 6e-3)
     foot = (strip.foot - strip.foot[:, [0]])[1:-1]  # the first and last row stand on the groove's ends
     inside = np.abs(strip.across) < 0.9e-3
@@ -70,9 +72,9 @@ def test_where_the_part_ends_there_are_no_columns():
     assert strip.there.all()
     y = strip.base[..., 1]
     assert low < y.min()
-    bare = Strip.of(
-        strip.arc, strip.across, (strip.base[:, 16], strip.along, strip.column), np.where(y > -1e-3, strip.foot, np.nan), np.broadcast_to(UP, strip.base.shape)
-    )
+    line = (strip.base[:, 16], strip.along, strip.column)
+    height = np.where(y > -1e-3, strip.foot, np.nan)
+    bare = Strip.of(strip.arc, strip.across, line, height, np.broadcast_to(UP, strip.base.shape))
     assert not bare.there[:, -1].any()
     assert np.isnan(bare.foot[:, -1]).all()
     assert bare.volume(np.full(bare.area.shape, 1e-3))[:, -1].max() == 0.0
