@@ -164,8 +164,8 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
         rows: Of ``run``.
 
     Returns:
-        As ``results.summarise`` has them, with ``pressure`` and the means of the bead's metrics over the trials
-        that reached; ``section_sd_pct`` is the spread of the mean section from run to run.
+        As ``results.summarise`` has them, with ``pressure`` and the means of the bead's metrics over the
+        trials that reached; ``section_sd_pct`` is the spread of the mean section from run to run.
     """
     table: list[Row] = []
     for part in dict.fromkeys(row["workpiece"] for row in rows):
@@ -177,7 +177,7 @@ def summarise(rows: Sequence[Row]) -> list[Row]:
                 for key in _MEANS:
                     values = [r[key] for r in whole if r.get(key) is not None]
                     more[key] = float(np.mean(values)) if values else None
-                    more[f"{key}_ci"] = results.bootstrap(values)
+                    more[f"{key.removesuffix('_pct')}_ci"] = results.bootstrap(values)
                 sections = [r["bead_section_pct"] for r in whole]
                 more["section_sd_pct"] = float(np.std(sections, ddof=1)) if len(sections) > 1 else None
                 table.append({"pressure": pressure, **line, **more})
@@ -271,10 +271,8 @@ def draw_corner(file: Path, seed: int) -> None:
     """
     env = {"perception": "vision", "renderer": "raycast", "sealant": True}
     figure, axes = plt.subplots(1, 3, figsize=(13, 4.6), layout="constrained", sharex=True, sharey=True)
-    image = None
 
-    def show(ax: Any, core: SealCore, title: str) -> None:
-        nonlocal image
+    def show(ax: Any, core: SealCore, title: str) -> Any:
         assert core.extrusion is not None
         bead = core.extrusion.bead
         strip, height = bead.strip, 1e3 * bead.height[0]
@@ -282,22 +280,23 @@ def draw_corner(file: Path, seed: int) -> None:
         low, high = core.scene.workpiece.seam.corners[0]
         rows = (strip.arc > low - 20e-3) & (strip.arc < high + 20e-3)
         shown = np.ma.masked_less(height[rows], 0.05)
-        image = ax.pcolormesh(
+        mesh = ax.pcolormesh(
             base[rows, :, 0], base[rows, :, 1], shown, shading="gouraud", vmin=0, vmax=5, cmap="viridis"
         )
         foot = 1e3 * strip.base[rows, len(strip.across) // 2]
         ax.plot(foot[:, 0], foot[:, 1], color="black", lw=0.8)
         ax.set(title=title, aspect="equal", xlabel="x [mm]")
         ax.grid(alpha=0.3)
+        return mesh
 
     for ax, pressure in zip(axes, PRESSURES, strict=False):
         trial = Pressed(method="rmp_expert", workpiece="rectangular", seed=seed, env=env, pressure=pressure)
         core, _, tips = seal(trial)
         show(ax, core, f"{pressure} pressure")
     smoothing_pass(core, 0, tips)
-    show(axes[2], core, "regulated, smoothed")
+    mesh = show(axes[2], core, "regulated, smoothed")
     axes[0].set_ylabel("y [mm]")
-    figure.colorbar(image, ax=axes, label="height of the bead [mm]", shrink=0.8)
+    figure.colorbar(mesh, ax=axes, label="height of the bead [mm]", shrink=0.8)
     figure.suptitle(f"The bead in a corner of the rectangular part from above, seed {seed} (line: the seam)")
     figure.savefig(file, dpi=130)
     plt.close(figure)
