@@ -38,7 +38,8 @@ def main() -> None:
                 spent[k, frame] = time.process_time() - start
         plain, laid = 1e6 * np.median(spent[:, _FIRST:], axis=1)
         print(
-            f"{part:12} {plain:6.0f} us a step, with sealant {laid:6.0f} us: {100 * (laid / plain - 1):.0f} % more"
+            f"{part:12} {plain:6.0f} us a step, with sealant {laid:6.0f} us: "
+            f"{100 * (laid / plain - 1):.0f} % more"
         )
 
 
