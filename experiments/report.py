@@ -83,12 +83,12 @@ ABOUT = {
     "bead_quality": (
         "The bead at constant and at regulated pressure",
         "Bead",
-        "Section of the bead along the seam, every run with another cartridge, and what smoothing makes of it.",
+        "The bead's section along the seam, each run with another cartridge, and what smoothing makes of it.",
     ),
     "bead_paths": (
         "Bead paths between two edges",
         "Bead paths",
-        "Nozzle paths with the same height at both edges, the naive ones beside them, and as the UR5 runs them.",
+        "Nozzle paths with the same height at both edges, naive ones beside them, and as the UR5 runs them.",
     ),
     "tau_jerk": (
         "Tau-Jerk motions",
