@@ -19,14 +19,15 @@ FRAME = CELL.timing.frame_s
 
 
 def reading(n=1, speed=0.01, about_x=0.0, about_z=0.0, d=0.0, seen=True):
-    twist = np.zeros((n, 6))
+    twist, seam = np.zeros((n, 6)), np.zeros((n, 6))
     twist[:, 1], twist[:, 3], twist[:, 5] = speed, about_x, about_z
+    seam[:, 3:] = twist[:, 3:]  # as the seam under a gun in a bend seems to turn
     d = np.full(n, d)
     return Reading(
         seen=np.full(n, seen),
         errors=SeamErrors(d, 0 * d, d, 0 * d, 0 * d),
         twist=twist,
-        seam_twist=np.zeros((n, 6)),
+        seam_twist=seam,
         tip_accel=np.zeros((n, 6)),
     )
 
