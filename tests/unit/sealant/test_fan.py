@@ -85,7 +85,7 @@ def test_a_nozzle_that_leans_ahead_lays_behind():
     strip = plate(length=0.06, half=12e-3)
     drag = 0.3
     time, position, rotation, flow = path(length=0.04, over=0.0, turn=axis_angle(X, -drag))
-    laid = lay_path(strip, time, position + [0.0, 0.01, 0.0], rotation, flow)
+    laid = lay_path(strip, time, position + 0.01 * Y, rotation, flow)
     along = laid.volume.sum(axis=1)
     # From y = 10 mm to 50 mm; the axis meets the plate d tan(drag) behind the mouth.
     centre = (along * strip.arc).sum() / along.sum()
@@ -114,7 +114,7 @@ def test_the_flow_follows_its_table():
 
 def test_rays_beside_the_strip_and_through_gaps_miss():
     time, position, rotation, flow = path(length=0.04, over=0.0)
-    position = position + [0.0, 0.01, 0.0]
+    position = position + 0.01 * Y
     narrow = plate(length=0.06, half=4e-3)
     laid = lay_path(narrow, time, position, rotation, flow)
     beyond = 1 - 2 * np.arctan(4.25e-3 / DISTANCE) / THETA
