@@ -1,6 +1,7 @@
 """Beads of fan-nozzle paths in the fast tier: the eight cases' surfaces, and the heights at both edges."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from seal_gym.sealant.fan import FanCfg, Laid, lay_path, settled
 from seal_gym.sealant.pneumatics import get_sealant
 from seal_gym.sealant.strip import Strip
 
+PATHS = ("naive", "ipopt", "robot")
 SPACING_M = 0.5e-3
 MARGIN_M = 8e-3
 # The border of a bead on columns is a column wide to either side; its height at an edge is the mean over a
@@ -26,6 +28,8 @@ _PLACE_STEP_M = 1e-3
 # turns by a hundredth of a radian over the bead's width has none.
 _CORNER_SHARE = 0.5
 _STRAIGHT = 0.01
+# A mean difference this small is the grid's; no factor is worth naming.
+EQUAL_MM = 0.02
 
 
 def centre_line(edges: Edges) -> Curve:
@@ -105,7 +109,8 @@ def _fillet(_case: BeadCase, edges: Edges, spacing_m: float) -> Strip:
     return Strip.of(s - s[0], across, line, height, np.broadcast_to(normal, (*height.shape, 3)))
 
 
-_SURFACES = {"corner_seam": _fillet, "over_corner": _profile, "stairs": _profile}
+# Of the cases that do not lie in a plane.
+SURFACES = {"corner_seam": _fillet, "over_corner": _profile, "stairs": _profile}
 
 
 def strip_of(case: BeadCase, edges: Edges, spacing_m: float = SPACING_M) -> Strip:
@@ -122,7 +127,7 @@ def strip_of(case: BeadCase, edges: Edges, spacing_m: float = SPACING_M) -> Stri
     Returns:
         The strip, from ``MARGIN_M`` before the bead to as far behind and beside it.
     """
-    return _SURFACES.get(case.name, _plane)(case, edges, spacing_m)
+    return SURFACES.get(case.name, _plane)(case, edges, spacing_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,4 +300,67 @@ def edge_heights(strip: Strip, laid: Laid, at: Places) -> EdgeHeights:
         left_m=heights_at(strip, laid, at.left),
         right_m=heights_at(strip, laid, at.right),
         missed=laid.missed_m3 / laid.sprayed_m3,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """The beads of one case's paths.
+
+    Attributes:
+        strip: The surface.
+        laid: Each path's bead, by the path's name.
+        heights: Their heights at both edges.
+    """
+
+    strip: Strip
+    laid: dict[str, Laid]
+    heights: dict[str, EdgeHeights]
+
+    def row(self) -> dict[str, Any]:
+        """The comparison in numbers.
+
+        Returns:
+            What ``EdgeHeights.row`` says of each of ``PATHS``, with its name before it, None for one that is
+            not there; ``ipopt_reduction`` and
+            ``robot_reduction``, by which factor the difference at the corners is smaller than the naive
+            path's; and ``reduction_word``, why there is none.
+        """
+        rows = {who: heights.row() for who, heights in self.heights.items()}
+        out: dict[str, Any] = {
+            f"{who}_{key}": rows[who][key] if who in rows else None for who in PATHS for key in rows["naive"]
+        }
+        naive = out["naive_laid_corner_mm"]
+        word = ""
+        if naive is None:
+            word = "no corner"
+        elif naive < EQUAL_MM:
+            word = "naive equal already"
+        elif "ipopt" not in rows:
+            word = "no path"
+        for who in PATHS[1:]:
+            out[f"{who}_reduction"] = None if word else naive / out[f"{who}_laid_corner_mm"]
+        return out | {"reduction_word": word}
+
+
+def compare(
+    case: BeadCase, edges: Edges, paths: dict[str, BeadPath], fan_angle_rad: float, settling: Settling
+) -> Comparison:
+    """Lays the beads of several paths and measures them.
+
+    Args:
+        case: The case.
+        edges: Its edges.
+        paths: By name, of ``PATHS``; ``naive`` among them.
+        fan_angle_rad: theta [rad].
+        settling: Of the beads.
+
+    Returns:
+        The beads.
+    """
+    strip = strip_of(case, edges)
+    at = places(edges, strip)
+    laid = {who: lay(strip, path, fan_angle_rad, settling) for who, path in paths.items()}
+    return Comparison(
+        strip=strip, laid=laid, heights={who: edge_heights(strip, bead, at) for who, bead in laid.items()}
     )
