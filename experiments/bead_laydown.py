@@ -330,12 +330,12 @@ class Comparison:
         out: dict[str, Any] = {
             f"{who}_{key}": rows[who][key] if who in rows else None for who in PATHS for key in rows["naive"]
         }
-        naive = out["naive_laid_corner_mm"]
+        naive, anywhere = out["naive_laid_corner_mm"], out["naive_laid_difference_mm"]
         word = ""
-        if naive is None:
-            word = "no corner"
-        elif naive < EQUAL_MM:
+        if (anywhere if naive is None else naive) < EQUAL_MM:
             word = "naive equal already"
+        elif naive is None:
+            word = "no corner"
         elif "ipopt" not in rows:
             word = "no path"
         for who in PATHS[1:]:

@@ -319,9 +319,10 @@ def markdown(rows: list[Row], settling: Settling) -> str:
         "higher there. Difference at corners: between "
         "left and right edge at equal shares of their lengths, where the centre line turns at least half as "
         "sharply as it does anywhere, mean (largest). Reduction: the naive mean difference over this one; "
-        f"where the naive one is below {bead_laydown.EQUAL_MM} mm, as with edges of equal length over a "
-        "corner and stairs, there is nothing to reduce. Beside the surface: naive path, in the half circle "
-        "through its gap."
+        f"where the naive one (without corners: its largest anywhere) is below {bead_laydown.EQUAL_MM} mm, "
+        "as with edges of equal length, there is nothing to reduce. Where the naive fan's inner border all "
+        "but stands still its heap is as high as the columns are narrow. Beside the surface: naive path, in "
+        "the half circle through its gap."
     )
     return "\n\n".join((first, text, second, laid_text, "\n".join(notes))).rstrip()
 

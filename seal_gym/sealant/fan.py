@@ -372,7 +372,7 @@ def lay_path(
 def settled(strip: Strip, laid: Laid, sealant: Sealant, duration_s: float) -> Laid:
     """The bead some time after laying, when it has crept under its weight.
 
-    A bead thinner than tau_y / (rho g), 15 mm for the stiffest sealants here, stays as it was laid.
+    A bead thinner than tau_y / (rho g), 15 mm for neutral silicone, stays as it was laid.
 
     Args:
         strip: The columns.
