@@ -134,10 +134,10 @@ class PressureRegulator:
         """See ``Pressure``."""
         cfg = self._cfg
         pressure, width, seen = _KPA * sealant[:, 0], _MM * sealant[:, 1], sealant[:, 2] > 0.5
-        moving = now.twist - now.seam_twist
-        speed = np.maximum(moving[:, 1] + moving[:, 3] * self._arm, 0.0)
+        # Of the gun alone: the seam under it seems to turn where it bends, though the part does not.
+        speed = np.maximum(now.twist[:, 1] + now.twist[:, 3] * self._arm, 0.0)
         near = _near(now, cfg.near_m)
-        turning = np.abs(moving[:, 5]) > cfg.straight_rad_s
+        turning = np.abs(now.twist[:, 5]) > cfg.straight_rad_s
         state[:, 1] = np.where(turning | ~near, 0.0, state[:, 1] + speed * self._frame_s)
         steady = near & seen & (speed > cfg.slow_m_s) & (state[:, 1] > cfg.settled_m)
         error = np.where(steady, (cfg.width_m - width) / cfg.width_slope_m, 0.0)

@@ -5,8 +5,9 @@
 For each case (Berg, Fig. 3.6): the optimal path by IPOPT and by SLSQP on N = 60 as the thesis has it, the
 naive path it is compared with, and the optimal one as the UR5 executes it. Heights are those of
 ``bead_projection.footprint``: rays along the fan's borders are followed to the surface. Writes the table as
-JSON, CSV and Markdown, and for each case a figure of the path and one of the parameters the thesis plots
-(its Figs. 4.1-4.8).
+JSON, CSV and Markdown, and for each case a figure of the path, one of the parameters the thesis plots
+(its Figs. 4.1-4.8), and one of the bead that the fast tier of the sealant's simulation lays, naive beside
+optimal.
 """
 
 import argparse
@@ -18,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments import bead_figures, command, results
+from experiments import bead_figures, bead_laydown, bead_maps, command, results
+from experiments.bead_laydown import PATHS, Settling
 from seal_gym.core.frames import Array
 from seal_gym.planning import bead_cases, bead_projection, robot_path
 from seal_gym.planning.bead_cases import BeadCase
@@ -30,6 +32,7 @@ from seal_gym.planning.bead_projection import Footprint
 from seal_gym.planning.bead_slsqp import solve_slsqp
 from seal_gym.planning.bead_solver import BeadSolution, Infeasibility, solve
 from seal_gym.planning.bead_symbols import load_casadi
+from seal_gym.sealant.pneumatics import SEALANTS
 
 NAME = "bead_paths"
 SLSQP_INTERVALS = 60
@@ -131,13 +134,14 @@ _NO_PATH: Row = {
 }
 
 
-def work(case: BeadCase, cfg: BeadCfg, out: Path) -> Row:
+def work(case: BeadCase, cfg: BeadCfg, out: Path, settling: Settling) -> Row:
     """All of one case.
 
     Args:
         case: The case.
         cfg: Limits and weights.
         out: Folder of the figures.
+        settling: Of the beads.
 
     Returns:
         A row of the table.
@@ -162,7 +166,7 @@ def work(case: BeadCase, cfg: BeadCfg, out: Path) -> Row:
     row |= by_slsqp(edges, case, cfg)
     if isinstance(found, Infeasibility):
         bead_figures.draw_paths(out / f"{NAME}_{case.name}.png", case, edges, naive, naive_print, None, None)
-        return row | {"reason": str(found)}
+        return row | {"reason": str(found)} | laid(case, edges, {"naive": naive}, cfg, out, settling)
     fine = found.nodes.finer(FINER)
     path, values = timed_path(edges, fine, cfg), quantities(edges, fine, cfg)
     foot, ipopt_row = measured(path, edges, cfg)
@@ -188,23 +192,51 @@ def work(case: BeadCase, cfg: BeadCfg, out: Path) -> Row:
     bead_figures.draw_parameters(
         out / f"{NAME}_{case.name}_parameters.png", case, values, cfg, naive, naive_print, robot, robot_print
     )
-    return row
+    paths = {"naive": naive, "ipopt": path, "robot": robot.path}
+    return row | laid(case, edges, paths, cfg, out, settling)
+
+
+def laid(
+    case: BeadCase, edges: Edges, paths: dict[str, BeadPath], cfg: BeadCfg, out: Path, settling: Settling
+) -> Row:
+    """The fast tier's beads of a case's paths.
+
+    Args:
+        case: The case.
+        edges: Its edges.
+        paths: By the prefix of their columns.
+        cfg: For the nozzle.
+        out: Folder of the figure.
+        settling: Of the beads.
+
+    Returns:
+        Their columns.
+    """
+    found = bead_laydown.compare(case, edges, paths, cfg.nozzle.fan_angle_rad, settling)
+    bead_maps.draw(out / f"{NAME}_{case.name}_bead.png", case, edges, found)
+    return found.row()
 
 
 def _peak_deg(angle: Array) -> float:
     return float(np.rad2deg(np.abs(angle).max()))
 
 
-def markdown(rows: list[Row]) -> str:
-    """The table for people.
+def markdown(rows: list[Row], settling: Settling) -> str:
+    """The tables for people.
 
     Args:
         rows: Of ``work``.
+        settling: Of the beads.
 
     Returns:
         Markdown.
     """
     number = results.number
+    settled_word = (
+        f"after {settling.duration_s:g} s of {settling.sealant} creeping"
+        if settling.duration_s
+        else "as laid, without creep"
+    )
     first = results.grid(
         [
             "case",
@@ -240,6 +272,30 @@ def markdown(rows: list[Row]) -> str:
             for r in rows
         ],
     )
+    second = results.grid(
+        [
+            "case",
+            "naive heights mm",
+            "optimal heights mm",
+            "heights by the UR5 mm",
+            "difference at corners, naive mm",
+            "optimal mm",
+            "by the UR5 mm",
+            "reduction, optimal",
+            "reduction by the UR5",
+            "beside the surface %",
+        ],
+        [
+            [
+                r["case"],
+                *(_pair(r, who, "min_mm", "max_mm", "{:.2f} to {:.2f}") for who in PATHS),
+                *(_pair(r, who, "corner_mm", "corner_worst_mm", "{:.3f} ({:.3f})") for who in PATHS),
+                *(r["reduction_word"] or f"{r[f'{who}_reduction']:.0f} times" for who in PATHS[1:]),
+                number(r["naive_missed_pct"], 1),
+            ]
+            for r in rows
+        ],
+    )
     notes = [f"- {r['case']}: {r['reason']}" for r in rows if r["reason"]]
     notes += [
         f"- {r['case']}, SLSQP: {r['slsqp_word']}" for r in rows if r["slsqp_word"] not in ("", "solved")
@@ -253,7 +309,28 @@ def markdown(rows: list[Row]) -> str:
         f"edges they should meet. SLSQP: N = {SLSQP_INTERVALS} steps in time, nothing holds between them. "
         "CPU time of one core, curves and CasADi loaded."
     )
-    return "\n\n".join((first, text, "\n".join(notes))).rstrip()
+    laid_text = (
+        "The same paths' beads in the fast tier of the sealant's simulation: rays of equal flow, evenly over "
+        "the fan, laid on columns of "
+        f"{1e3 * bead_laydown.SPACING_M:g} mm. Height at an edge: mean over the columns within "
+        f"{1e3 * bead_laydown.PATCH_M:g} mm of a place {1e3 * bead_laydown.INSET_M:g} mm inside it, every "
+        f"millimetre, smallest to largest over both edges; {settled_word}; along the columns, "
+        "which spread over a convex bend and close in a hollow one, so that the same sealant stands lower or "
+        "higher there. Difference at corners: between "
+        "left and right edge at equal shares of their lengths, where the centre line turns at least half as "
+        "sharply as it does anywhere, mean (largest). Reduction: the naive mean difference over this one; "
+        f"where the naive one (without corners: its largest anywhere) is below {bead_laydown.EQUAL_MM} mm, "
+        "as with edges of equal length, there is nothing to reduce. Where the naive fan's inner border all "
+        "but stands still its heap is as high as the columns are narrow. Beside the surface: naive path, in "
+        "the half circle through its gap."
+    )
+    return "\n\n".join((first, text, second, laid_text, "\n".join(notes))).rstrip()
+
+
+def _pair(row: Row, who: str, first: str, second: str, form: str) -> str:
+    """Two numbers of a path's bead for people."""
+    values = row[f"{who}_laid_{first}"], row[f"{who}_laid_{second}"]
+    return "-" if None in values else form.format(*values)
 
 
 def make(options: argparse.Namespace) -> str:
@@ -270,9 +347,11 @@ def make(options: argparse.Namespace) -> str:
     load_casadi()
     cfg = BeadCfg()
     names = list(dict.fromkeys(options.case or bead_cases.CASES))
-    rows = [work(bead_cases.get(name), cfg, options.out) for name in tqdm(names, desc="cases", unit="case")]
-    text = markdown(rows)
-    pictures = [f"![{r['case']}]({NAME}_{r['case']}.png)" for r in rows]
+    settling = Settling(sealant=options.sealant, duration_s=options.settle)
+    progress = tqdm(names, desc="cases", unit="case")
+    rows = [work(bead_cases.get(name), cfg, options.out, settling) for name in progress]
+    text = markdown(rows, settling)
+    pictures = [f"![{r['case']}{end}]({NAME}_{r['case']}{end}.png)" for r in rows for end in ("", "_bead")]
     results.write(
         options.out,
         NAME,
@@ -300,8 +379,21 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--case", action="append", choices=bead_cases.CASES, help="may be repeated (default: all)"
     )
+    parser.add_argument(
+        "--settle",
+        type=float,
+        default=0.0,
+        help="seconds for which the beads creep under their weight before they are measured (default: "
+        "%(default)s: stiff sealants stay)",
+    )
+    parser.add_argument(
+        "--sealant",
+        default=Settling.sealant,
+        choices=sorted(SEALANTS),
+        help="that creeps (default: %(default)s)",
+    )
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
-    return command.checked(parser, arguments)
+    return command.checked(parser, arguments, settle=0)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -80,6 +80,26 @@ ABOUT = {
         "Calibration",
         "Sensor cameras calibrated from pictures of a board, and the part's pose from its code.",
     ),
+    "bead_quality": (
+        "The bead at constant and at regulated pressure",
+        "Bead",
+        "The bead's section along the seam, each run with another cartridge, and what smoothing makes of it.",
+    ),
+    "bead_paths": (
+        "Bead paths between two edges",
+        "Bead paths",
+        "Nozzle paths with the same height at both edges, naive ones beside them, and as the UR5 runs them.",
+    ),
+    "tau_jerk": (
+        "Tau-Jerk motions",
+        "Tau-Jerk",
+        "Motions from rest to rest by tau-Jerk, quintic, trapezoid and Ruckig under the same limits.",
+    ),
+    "inverse_kinematics": (
+        "Inverse kinematics",
+        "Inverse kinematics",
+        "How often and how fast closed form and Newton's method find a posture for a pose.",
+    ),
     "tune_edges": (
         "Settings of the edge methods",
         "Edge settings",
@@ -96,6 +116,8 @@ _FIRST = (
     "table2",
     "fig12",
     "fig15",
+    "bead_quality",
+    "bead_paths",
     "learning_curves",
 )
 
@@ -199,7 +221,7 @@ def read(folder: Path) -> dict[Path, dict[str, Any]]:
     require(bool(found), f"--results {folder}: no result in it; run an experiment with --out {folder}")
 
     def order(path: Path) -> tuple[int, str, int]:
-        name = found[path]["name"]
+        name = _kind(found[path]["name"])
         return (_FIRST.index(name) if name in _FIRST else len(_FIRST), name, len(path.parts))
 
     return {path: found[path] for path in sorted(found, key=order)}
@@ -273,10 +295,15 @@ def owner(path: Path, documents: dict[Path, dict[str, Any]]) -> Path | None:
     return next(parts, None)
 
 
+def _kind(name: str) -> str:
+    """The experiment of a result, which may add what it was run on: ``fig15`` of ``fig15_rectangular``."""
+    return next((kind for kind in ABOUT if name == kind or name.startswith(f"{kind}_")), name)
+
+
 def _section(
     path: Path, document: dict[str, Any], folder: Path, out: Path, pictures: list[Media], videos: list[Media]
 ) -> Section:
-    name = document["name"]
+    name = _kind(document["name"])
     title, short, about = ABOUT.get(name, (name, name, ""))
     if document.get("renderer") == "none":
         about += " Features from the true geometry (oracle), without images."

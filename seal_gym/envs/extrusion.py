@@ -177,7 +177,7 @@ class Extrusion:
 
         Returns:
             ``pressure_kpa`` and ``flow_mm3_s`` at the nozzle; ``bead_width_mm`` and ``bead_seen`` as
-            observed; ``bead_section_pct``: the true section behind the tip, relative to the wanted one (NaN
+            observed; ``bead_section_pct``: the true section behind the tip, relative to the wanted one (0
             before the seam's start), for metrics, not for policies.
         """
         line = self.bead.line
@@ -186,7 +186,7 @@ class Extrusion:
             "flow_mm3_s": float(1e9 * line.flow_m3_s[i]),
             "bead_width_mm": float(_MM * self.width.width_m[i]),
             "bead_seen": bool(self.width.seen[i]),
-            "bead_section_pct": 100.0 * self.share(i),
+            "bead_section_pct": float(np.nan_to_num(100.0 * self.share(i))),
         }
 
     def infos(self) -> dict[str, NDArray[Any]]:

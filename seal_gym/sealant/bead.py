@@ -288,6 +288,22 @@ class Bead:
         tops = self.strip.base[::stride] + 0.5 * height[..., None] * self.strip.column[::stride, None]
         return (share[..., None] * tops).sum(axis=1), np.sqrt(total / self._spacing / np.pi)
 
+    def contact(self, i: int) -> Array:
+        """How far one bead reaches over the surface to either side of its seam.
+
+        Args:
+            i: Which simulation.
+
+        Returns:
+            Length of wet surface to the left and to the right along the sealed stretch, shape (S, 2), m: in a
+            fillet, on the wall and on the plate.
+        """
+        wet = self.height[i, self.inside] > WET_M
+        middle = len(self.strip.across) // 2
+        left = wet[:, :middle] * self.strip.gap_across[self.inside, :middle]
+        right = wet[:, middle + 1 :] * self.strip.gap_across[self.inside, middle:-1]
+        return np.stack((left.sum(axis=1), right.sum(axis=1)), axis=1)
+
     def section_share(self, i: int, s: float, span_m: float) -> float:
         """How much of the wanted bead lies on a stretch of the seam.
 

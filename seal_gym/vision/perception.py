@@ -236,7 +236,7 @@ def _track(
             p[a] += tip[b, a] * (state.point[i, b] - tip[b, 3])
             d[a] += tip[b, a] * state.direction[i, b]
     nearest_point(p, d)
-    curve = np.zeros(3)
+    curve = np.zeros(4)
     _edges_of(i, front, 0, mask_front, e, maps, s)
     if track_front(i, tip, mask_front, ref[0], g, lp, par, state, s, p, d, curve):
         state.missed[i, 0] = 0
@@ -244,7 +244,7 @@ def _track(
     else:
         state.missed[i, 0] += 1
     _edges_of(i, side, 1, mask_side, e, maps, s)
-    if track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2]):
+    if track_side(i, mask_side, g, lp, par, state, s, p, d, curve[2], curve[3]):
         state.missed[i, 1] = 0
         learn_levels(i, 1, par, state)
     else:

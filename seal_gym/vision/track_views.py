@@ -25,6 +25,9 @@ _GROOVE_REACH = 0.5
 _BEND_SHARE, _BEND_M = 0.3, 2.5 * _MM
 _HIDDEN = 3.0  # an edge this close to the ROI's border has no flank to compare with [px]
 _HEIGHT_FLOOR, _PITCH_FLOOR = 0.02 * _MM, 0.1 * _DEG  # a measurement is no better than this
+_UNSEEN = 3.0  # how much faster the plane drifts while a bend hides it
+_NEAR_SHARE = 0.7  # of the rows ahead that count past the paste, before a bend to come
+_TURN_PX = 3.2  # departure of the edge ahead from its tangent that is a bend to come
 _BENT, _BENT_SHARE = (
     40.0,
     1.0 / 3.0,
@@ -107,6 +110,16 @@ def learn_levels(i: int, view: int, par: TrackNumbers, state: TrackState) -> Non
 
 
 @kernel
+def _turn_ahead(points: Array, count: int, o: float, slope: float, reach: float) -> float:
+    """How far the followed edge departs from its tangent within some rows ahead [px]."""
+    out = 0.0
+    for k in range(count):
+        if 0.0 < points[k, 0] <= reach:
+            out = max(out, abs(points[k, 1] - o - slope * points[k, 0]))
+    return out
+
+
+@kernel
 def track_front(
     i: int,
     tip: Array,
@@ -146,6 +159,8 @@ def track_front(
             s.profile,
             s.points,
         )
+        if par.lays:
+            curve[3] = _turn_ahead(s.points, count, o, line[2], 2.0 * par.side_px)
         line[0] = ref[0]
         line[1] = o
         enough = count >= MIN_ROWS
@@ -259,7 +274,8 @@ def _side_residual(
         skip = _past_sealant(mask, line, skip, par.side_px)
     reach = _reach(section, line[2], par)
     first = int(line[0] + skip - par.side_px)
-    for row in range(first, int(line[0] + skip + par.side_px) + 1):
+    span = par.side_px if not par.lays else _NEAR_SHARE * par.side_px
+    for row in range(first, int(line[0] + skip + span) + 1):
         t = row + 0.5 - line[0]
         y = t / scale
         for _ in range(2):
@@ -315,6 +331,7 @@ def track_side(  # noqa: PLR0911  # each return is a reason not to have seen the
     p: Array,
     d: Array,
     bend: float,
+    turn_px: float,
 ) -> bool:
     """Step 3: corrects height and pitch of the plane through the tangent (tip frame)."""
     line, n, m, lift = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -327,8 +344,10 @@ def track_side(  # noqa: PLR0911  # each return is a reason not to have seen the
     if not _usual(i, 1, mask, line, 0, section, par, state, s):
         return False
     # Under its own paste the gun sees rows further ahead only, which a bend turns away: until it is over, the
-    # plate's plane in the world has to do.
-    if par.lays and abs(bend) >= _BENT:
+    # plate's plane in the world has to do, and grows less sure.
+    if par.lays and (abs(bend) >= _BENT or turn_px > _TURN_PX):
+        state.variance[i, 0] += (_UNSEEN * par.height_q_m) ** 2
+        state.variance[i, 1] += (_UNSEEN * par.pitch_q_rad) ** 2
         return True
     if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
         return par.lays

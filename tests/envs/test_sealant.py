@@ -307,3 +307,34 @@ def test_an_action_without_pressure_is_refused():
     env.reset(seed=0)
     with pytest.raises(ActionError, match=r"takes numbers of shape \(28,\)"):
         env.step(np.zeros(27, np.float32))
+
+
+def test_a_smoothing_pass_widens_the_contact_and_touches_nothing():
+    from seal_gym.envs.smoothing import inverse, smoothing_pass
+
+    core = core_of(seed=4)
+    policy = policy_for(core)
+    observation, state, tips = core.observe(), None, []
+    while True:
+        action, state = policy.predict(observation, state)
+        result = core.step(action)
+        observation = core.observe()
+        tips.append(inverse(core.arm.part_pose[0]) @ core.tip.pose[0])
+        if result.terminated[0] or result.timeout[0]:
+            break
+    bead = core.extrusion.bead
+    before, contact = bead.volume.sum(), bead.contact(0).mean(axis=0)
+    out = smoothing_pass(core, 0, np.array(tips))
+    assert result.reached[0]
+    assert not out.touched
+    # The arm follows the tool path to half a millimetre.
+    assert np.linalg.norm(out.centres - out.wanted[:, :3, 3], axis=1).max() < 0.5e-3
+    assert bead.volume.sum() + out.removed_m3 == pytest.approx(before, rel=1e-12)
+    assert (bead.contact(0).mean(axis=0) > 1.7 * contact).all()
+
+
+def test_smoothing_without_sealant_is_refused():
+    from seal_gym.envs.smoothing import smoothing_pass
+
+    with pytest.raises(ConfigError, match="sealant=True"):
+        smoothing_pass(core_of(sealant=False), 0, np.tile(np.eye(4), (2, 1, 1)))

@@ -40,6 +40,10 @@ def test_rows_say_what_the_planner_says(rows):
     assert row["ipopt_spread_pct"] < 2.0
     assert row["robot_spread_pct"] < 2.0
     assert row["slow_down"] > 1.0
+    # What the fast tier lays, slowed down or not; both edges are alike in this case.
+    assert row["ipopt_laid_left_mm"] == pytest.approx(row["robot_laid_left_mm"], rel=0.01)
+    assert row["ipopt_laid_left_mm"] == pytest.approx(row["ipopt_height_mean_mm"], rel=0.05)
+    assert row["robot_missed_pct"] == 0.0
     assert row["robot_time_s"] == pytest.approx(row["slow_down"] * case.duration_s)
 
 
@@ -50,6 +54,9 @@ def test_a_case_without_a_path_has_its_reason_and_no_numbers(rows):
     assert row["ipopt_spread_pct"] is None
     assert row["slow_down"] is None
     assert row["slsqp_word"].startswith("SLSQP ended")
+    assert row["ipopt_laid_min_mm"] is None
+    assert row["reduction_word"] == "no path"
+    assert row["naive_laid_corner_mm"] > 1.0
     # Its inner border all but stands still in the corners.
     assert row["naive_height_max_mm"] > 5 * row["naive_height_min_mm"]
 
@@ -59,7 +66,14 @@ def test_files(out, rows):
         assert [r["case"] for r in csv.DictReader(file)] == list(rows)
     text = (out / "bead_paths.md").read_text()
     assert "infeasible, proven" in text
-    for name in ("over_corner", "over_corner_parameters", "small_square"):
+    assert "naive equal already" in text
+    for name in (
+        "over_corner",
+        "over_corner_parameters",
+        "over_corner_bead",
+        "small_square",
+        "small_square_bead",
+    ):
         picture = imageio.imread(out / f"bead_paths_{name}.png")
         assert picture.std() > 5
     assert not (out / "bead_paths_small_square_parameters.png").exists()
@@ -74,3 +88,9 @@ def test_an_unknown_case_is_refused(capsys):
     with pytest.raises(SystemExit):
         bead_paths.main(["--case", "circle"])
     assert "invalid choice" in capsys.readouterr().err
+
+
+def test_settling_backwards_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        bead_paths.main(["--settle", "-1"])
+    assert "at least 0" in capsys.readouterr().err
