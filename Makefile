@@ -79,5 +79,5 @@ $(VENV)/.setup-dev: $(VENV)/.setup-test
 	@touch $@
 
 $(LATEST)/.setup: $(SETUP_FILES)
-	@bash tools/setup.sh $(LATEST) sb3,viz,test --upgrade --upgrade-strategy eager
+	@bash tools/setup.sh $(LATEST) planning,sb3,viz,test --upgrade --upgrade-strategy eager
 	@touch $@
