@@ -1,1 +1,1 @@
-"""Sealant: pneumatics, deposition on the part, laydown reference, cross-sections. Arrays in, arrays out."""
+"""Sealant: pneumatics, the bead on the part, smoothing. Arrays in, arrays out."""
