@@ -307,7 +307,7 @@ def test_a_leaf_that_goes_wrong_is_named(make):
 
 @pytest.mark.parametrize(
     "kwargs", [{"reward": None}, {"look": 3}, {"task": {"reach_m": 1}}, {"cell": "x"}, {"leaves": None},
-               {"leaves": (3,)}, {"workpiece": [1]}, {"sealant": True}]
+               {"leaves": (3,)}, {"workpiece": [1]}, {"sealant": 1}]
 )  # fmt: skip
 def test_arguments_of_a_wrong_type_are_named(kwargs):
     (name,) = kwargs

@@ -107,8 +107,8 @@ class Curtain:
         self.start, self.frames, self.change = start, frames, change
         self.sensors.images = self.images
 
-    def images(self, pose, arm, frame):
-        seen = self.see(pose, arm, frame)
+    def images(self, pose, arm, frame, bead=None):
+        seen = self.see(pose, arm, frame, bead)
         k = int(frame[0]) - self.start
         if not 0 <= k < self.frames:
             return seen
