@@ -1,0 +1,1 @@
+"""Sealant: pneumatics, deposition on the part, laydown reference, cross-sections. Arrays in, arrays out."""
