@@ -24,7 +24,7 @@ from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError
 from seal_gym.sealant.laydown.paths import TRAINING, VALIDATION, CentrePath
 
 _CELLS_MM = (2.0, 1.5, 1.0, 0.75, 0.5)
-_END_M = 12e-3  # of a path, where the bead begins and ends: not used as cross-sections
+_END_M = 10e-3  # of a path, where the bead begins and ends: not used as cross-sections
 _CLEARANCE_M = (4e-3, 16e-3)
 _STRAIGHT = CentrePath(name="straight", substrate="plane", legs=((40e-3, 0.0),))
 _STRAIGHT_DRAWS = np.tile([30e-3, 0.3, 0.0, 0.0, 0.0], (2, 1))
@@ -75,7 +75,9 @@ class Job:
 
 def _with_grid(cfg: LaydownCfg, cell_m: float, solver: str) -> LaydownCfg:
     clearance = float(np.clip(1.3 * run.expected_peak_m(cfg) + 2.5e-3, *_CLEARANCE_M))
-    clearance = math.ceil(clearance / 2e-3 - 1e-9) * 2e-3  # the same box for every cell size of the grid study
+    clearance = (
+        math.ceil(clearance / 2e-3 - 1e-9) * 2e-3
+    )  # the same box for every cell size of the grid study
     grid = replace(cfg.grid, cell_m=cell_m, solver=solver, clearance_m=clearance)
     return replace(cfg, grid=grid)
 
@@ -263,9 +265,7 @@ def grid_cfg(cell_mm: float, solver: str) -> LaydownCfg:
     Returns:
         40 mm of it at 0.3 m/s, 30 mm above the plane.
     """
-    return _with_grid(
-        LaydownCfg(path=paths.tip_path(_STRAIGHT, _STRAIGHT_DRAWS)), cell_mm * 1e-3, solver
-    )
+    return _with_grid(LaydownCfg(path=paths.tip_path(_STRAIGHT, _STRAIGHT_DRAWS)), cell_mm * 1e-3, solver)
 
 
 def do_grid(options: argparse.Namespace) -> str:
@@ -325,10 +325,18 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--cell", type=float, default=1.0, help="of the runs, mm (default: %(default)s)")
     parser.add_argument(
-        "--cells", type=float, nargs="+", default=_CELLS_MM, help="of the grid study, mm (default: %(default)s)"
+        "--cells",
+        type=float,
+        nargs="+",
+        default=_CELLS_MM,
+        help="of the grid study, mm (default: %(default)s)",
     )
-    parser.add_argument("--solver", default="interFoam", choices=("interFoam", "interIsoFoam"), help="of the runs")
-    parser.add_argument("--limit", type=float, default=3600.0, help="time for each run, s (default: %(default)s)")
+    parser.add_argument(
+        "--solver", default="interFoam", choices=("interFoam", "interIsoFoam"), help="of the runs"
+    )
+    parser.add_argument(
+        "--limit", type=float, default=3600.0, help="time for each run, s (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the draws (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/laydown"), help="folder (default: %(default)s)")

@@ -31,7 +31,9 @@ def build_mesh(cfg: LaydownCfg) -> Mesh:
     """
     part, grid = SUBSTRATES[cfg.substrate], cfg.grid
     place = jet.landings(cfg)[2][:, :2]
-    return meshes.build(part, place.min(0) - grid.margin_m, place.max(0) + grid.margin_m, grid.clearance_m, grid.cell_m)
+    return meshes.build(
+        part, place.min(0) - grid.margin_m, place.max(0) + grid.margin_m, grid.clearance_m, grid.cell_m
+    )
 
 
 def transport(fluid: FluidCfg) -> dict[str, Entry]:
@@ -88,7 +90,7 @@ def control(grid: GridCfg, end_s: float) -> dict[str, Entry]:
         "adjustTimeStep": "yes",
         "maxCo": float(grid.courant),
         "maxAlphaCo": float(grid.courant),
-        "maxDeltaT": 0.5 * grid.inlet_dt_s,
+        "maxDeltaT": grid.inlet_dt_s,
         "runTimeModifiable": "no",
     }
 

@@ -100,7 +100,7 @@ class GridCfg:
 
     cell_m: float = 1e-3
     clearance_m: float = 6e-3
-    margin_m: float = 6e-3
+    margin_m: float = 5e-3
     solver: Literal["interFoam", "interIsoFoam"] = "interFoam"
     courant: float = 0.5
     inlet_dt_s: float = 1e-3
@@ -174,7 +174,9 @@ class TcpPath:
             Shape (m, 3) [m/s].
         """
         legs = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
-        return np.asarray(legs[np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(legs) - 1)])
+        return np.asarray(
+            legs[np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(legs) - 1)]
+        )
 
     def volume_m3(self) -> float:
         """What the nozzle gives along the whole path.

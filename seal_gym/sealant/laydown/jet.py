@@ -141,9 +141,13 @@ def landings(cfg: LaydownCfg) -> tuple[Parcels, Array, Array]:
         LaydownError: If a part of the jet misses the substrate.
     """
     jet, surface = emit(cfg), SUBSTRATES[cfg.substrate].height
-    t, place, _ = fly(jet.positions, jet.velocities, np.asarray(cfg.gravity_mps2), surface, reach_s=_reach_s(cfg))
+    t, place, _ = fly(
+        jet.positions, jet.velocities, np.asarray(cfg.gravity_mps2), surface, reach_s=_reach_s(cfg)
+    )
     if np.isnan(t).any():
-        raise LaydownError(f"{np.isnan(t).mean():.1%} of the jet does not come down on the substrate: tilt or drag less")
+        raise LaydownError(
+            f"{np.isnan(t).mean():.1%} of the jet does not come down on the substrate: tilt or drag less"
+        )
     return jet, jet.times_s + t, place
 
 
