@@ -207,7 +207,7 @@ def _make() -> tuple[tuple[CentrePath, ...], tuple[CentrePath, ...]]:
         make(name="ridge_oblique", substrate="ridge", heading_rad=diagonal, surface_normal=True),
     )
     validation = (
-        make(name="stairs_edge", substrate="stairs", shift_m=(3.5e-3, 0.0)),
+        make(name="stairs_edge", substrate="stairs", shift_m=(4e-3, 0.0)),
         make(name="stairs_tread", substrate="stairs", legs=_arc(60e-3, 120e-3)),
         make(name="ramp_foot", substrate="ramp"),
         make(name="ramp_oblique", substrate="ramp", heading_rad=-diagonal),
