@@ -62,7 +62,7 @@ class NozzleCfg:
         radius_m: Of the round jet [m].
         jet_speed_mps: Of the fluid relative to the tip [m/s]. A sheet's thickness at the distance r follows
             from it: flow / (fan_angle_rad r jet_speed_mps).
-        strip_m: Thickness of the strip over which a sheet's fluid is given to the substrate [m].
+        strip_m: Thickness of the strip over which a sheet's fluid comes in [m].
     """
 
     kind: Literal["fan", "round"] = "fan"
@@ -86,6 +86,8 @@ class GridCfg:
     Attributes:
         cell_m: Edge of a cell [m].
         clearance_m: Height of the mesh above the highest part of the substrate [m].
+        inlet: Where the jet comes in: ``"substrate"``: through the faces that it lands on, without momentum;
+            ``"top"``: through the mesh's top, in strips that it fills, slowed down as their thickness asks.
         margin_m: Mesh around the area that the jet meets [m].
         solver: ``"interFoam"`` (interface compression) or ``"interIsoFoam"`` (geometric interface).
         courant: Largest Courant number.
@@ -95,6 +97,7 @@ class GridCfg:
 
     cell_m: float = 1e-3
     clearance_m: float = 6e-3
+    inlet: Literal["substrate", "top"] = "substrate"
     margin_m: float = 6e-3
     solver: Literal["interFoam", "interIsoFoam"] = "interFoam"
     courant: float = 0.5
@@ -105,6 +108,7 @@ class GridCfg:
         _in_range("cell_m", self.cell_m, 1e-4, 5e-3, "m")
         _in_range("clearance_m", self.clearance_m, 2e-3, 5e-2, "m")
         _in_range("margin_m", self.margin_m, 1e-3, 5e-2, "m")
+        require(self.inlet in ("substrate", "top"), f"inlet = {self.inlet!r}: must be 'substrate' or 'top'")
         require(self.solver in SOLVERS, f"solver = {self.solver!r}: must be one of {', '.join(SOLVERS)}")
         _in_range("courant", self.courant, 0.05, 2.0, "")
         _in_range("inlet_dt_s", self.inlet_dt_s, 1e-5, 1e-2, "s")

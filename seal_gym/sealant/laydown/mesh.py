@@ -54,6 +54,19 @@ class Mesh:
         area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         return corners.mean(1), area
 
+    def top(self, x: Array, y: Array) -> Array:
+        """The mesh's top.
+
+        Args:
+            x: Shape (...) [m].
+            y: Shape (...) [m].
+
+        Returns:
+            z, shape (...) [m].
+        """
+        flat = self.origin[2] + self.cell_ids.shape[2] * self.cell_m
+        return np.asarray(flat + self.substrate.smooth(x, y))
+
     def cells_at(self, points: Array) -> Indices:
         """Which cells hold some points.
 
