@@ -7,7 +7,7 @@ arrives stretched or compressed.
 A fan's sheet is some 0.2 mm thick where it lands, far thinner than an affordable cell: let in through the top
 of the mesh it has to be made thicker and slower, and then hangs together, tears or drags air along. The real
 one loses its momentum within about its own thickness (Reynolds number of the impact about 2). By default its
-fluid is therefore given to the substrate's faces where it comes down, without momentum, and pushes up what lies
+fluid is therefore given to the substrate's faces where it comes down, without momentum, and pushes up what is
 there.
 """
 
