@@ -205,7 +205,7 @@ def _write_mesh(mesh: Mesh, folder: Path) -> None:
     )
 
 
-def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path) -> None:
+def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path, *, fractions: bool) -> None:
     folder.mkdir(parents=True)
     (folder / "points").write_text(foam.values(centres))
     wet = flow.flows_m3s > 0
@@ -216,7 +216,8 @@ def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path) -> None:
         at = folder / f"{time:.9g}"
         at.mkdir()
         (at / "U").write_text(foam.values(velocity))
-        (at / f"alpha.{FLUID}").write_text(foam.values(full.astype(float)))
+        if fractions:
+            (at / f"alpha.{FLUID}").write_text(foam.values(full.astype(float)))
 
 
 def _boundaries(inlet: str) -> dict[str, tuple[str, str, dict[str, Entry]]]:
@@ -264,7 +265,8 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
     end_s = round(float(flow.times_s[-1]) + cfg.grid.settle_s, 9)
     _write_mesh(mesh, folder / "constant" / "polyMesh")
     inlet = cfg.grid.inlet
-    _write_inflow(flow, mesh.faces_of(inlet)[0], folder / "constant" / "boundaryData" / inlet)
+    data = folder / "constant" / "boundaryData" / inlet
+    _write_inflow(flow, mesh.faces_of(inlet)[0], data, fractions=inlet == "top")
     skewed = bool(np.ptp(mesh.substrate.smooth(mesh.points[:, 0], mesh.points[:, 1])) > 0)
     gravity: dict[str, Entry] = {
         "dimensions": "[0 1 -2 0 0 0 0]",
