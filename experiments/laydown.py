@@ -155,7 +155,7 @@ def markdown(rows: list[Row]) -> str:
     return (
         f"A fan of 40 deg, {1e3 * HEIGHT_M:g} mm above a plane, {SPEED_MPS:g} m/s: flow / speed is "
         f"{rows[0]['ideal_mm2']:.1f} mm², the fan {fan_mm:.1f} mm wide. Area, width (where it is 0.5 mm "
-        "thick) and height are means of 18 sections 1 mm apart; IoU is of the mean section in pixels of 1 mm: "
+        "thick) and height are means of 18 sections 1 mm apart; IoU is of the mean section in 1 mm pixels: "
         "with the same solver on the finest grid of that inlet, and with the other solver on the same "
         "grid.\n\n" + results.grid(head, body)
     )
