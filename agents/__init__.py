@@ -159,7 +159,9 @@ def control_of(name: str) -> str:
     return _find(name).control
 
 
-def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Policy:
+def load_policy(
+    name: str, env: Any = None, *, trust_zip: bool = False, pressure: str = "regulated"
+) -> Policy:
     """A policy by name, or from a file. Nothing in a file is executed.
 
     Args:
@@ -171,6 +173,7 @@ def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Polic
             it, and acts in no other.
         trust_zip: Lets Stable-Baselines3 load a ``.zip``, which can run any code that is in it: for models
             that cannot be built anew (custom policies, images), from a source you trust.
+        pressure: In an environment with sealant, who presses the gun (``agents.pressure.PRESSURES``).
 
     Returns:
         The policy.
@@ -189,4 +192,9 @@ def load_policy(name: str, env: Any = None, *, trust_zip: bool = False) -> Polic
             f"policy {name!r} acts with control={found.control!r}, the environment has {cfg.control!r}: "
             f"make it with control={found.control!r}"
         )
-    return found.make(env if found.senses else cfg.cell)
+    policy = found.make(env if found.senses else cfg.cell)
+    if not cfg.sealant:
+        return policy
+    from agents.pressure import with_pressure
+
+    return with_pressure(policy, cfg.cell, cfg.sealant, pressure)

@@ -1,348 +1,296 @@
-"""The laydown reference: a grid study, runs over named substrates, and the cross-sections that they give.
+"""Reference simulations of sealant laydown with OpenFOAM: a grid study, and the surrogate's data.
 
-``python -m experiments.laydown grid`` compares cell sizes and solvers on a straight bead; ``runs`` computes the
-simulations of the data set, one after another and none twice; ``sections`` writes the data set from them.
+    python -m experiments.laydown grid --out experiments/results --jobs 1
+    python -m experiments.laydown runs --out out/laydown --draws 4 --seed 0 --jobs 1
+
+``grid`` lays one straight bead with a fan on a plane at several cell sizes, with both solvers and both
+inlets, and compares each with the finest of its inlet. It writes laydown_grid.json, .csv, .md and .png.
+
+``runs`` draws paths around 25 centre paths and 12 unseen ones on an obstacle course (Berg 3.2.2), ``--draws``
+around each, one around each before the next. It writes <centre path>.npz: what the surrogate is told and
+what it has to predict, by section; and laydown_runs.json, .csv, .md. Both go on where they were stopped.
 """
 
 import argparse
 import json
 import math
 import sys
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from experiments import command, laydown_report, results
-from seal_gym.core.frames import Array
-from seal_gym.sealant.laydown import paths, run, sections
-from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError
-from seal_gym.sealant.laydown.paths import TRAINING, VALIDATION, CentrePath
+from agents import engines
+from experiments import command, laydown_data, laydown_figures, results
+from seal_gym.sealant.laydown import foam, sections
+from seal_gym.sealant.laydown.config import SOLVERS, THESIS_FLOW_M3S, GridCfg, LaydownCfg, TcpPath
+from seal_gym.sealant.laydown.run import simulate
 
-_CELLS_MM = (2.0, 1.5, 1.0, 0.75, 0.5)
-_END_M = 10e-3  # of a path, where the bead begins and ends: not used as cross-sections
-_CLEARANCE_M = (4e-3, 16e-3)
-_STRAIGHT = CentrePath(name="straight", substrate="plane", legs=((40e-3, 0.0),))
-_STRAIGHT_DRAWS = np.tile([30e-3, 0.3, 0.0, 0.0, 0.0], (2, 1))
-_WORST_VOLUME = 5e-3
-_SECTION_KEYS = ("linear_mps", "angular_radps", "gravity_mps2", "heights_m", "arcs_m", "ideal_m2")
+NAME = "laydown"
+LENGTH_M, SPEED_MPS, HEIGHT_M = 40e-3, 0.3, 30e-3
+STEADY = slice(12, 30)  # sections [mm], away from the bead's ends
+CELLS_MM = {"substrate": (2.0, 1.0, 0.75, 0.5), "top": (2.0, 1.0)}
+_LIMIT_S = 7200.0
+
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Job:
-    """One simulation of the data set.
+class Case:
+    """One simulation of the grid study.
 
     Attributes:
-        split: ``"training"`` or ``"validation"``.
-        centre: The centre path.
-        number: Of the centre path within its split.
-        draw: Number of the random draw.
+        inlet: See ``GridCfg``.
+        solver: OpenFOAM's.
+        cell_mm: Edge of a cell.
     """
 
-    split: str
-    centre: CentrePath
-    number: int
-    draw: int
-
-    @property
-    def name(self) -> str:
-        """File name."""
-        return f"{self.centre.name}.{self.draw}"
-
-    def cfg(self, seed: int, cell_m: float, solver: str) -> LaydownCfg:
-        """The simulation.
-
-        Args:
-            seed: Of the data set.
-            cell_m: Edge of a cell [m].
-            solver: OpenFOAM's program.
-
-        Returns:
-            With a mesh as high as the bead needs.
-        """
-        rng = np.random.default_rng([seed, self.split == "validation", self.number, self.draw])
-        cfg = LaydownCfg(
-            path=paths.random_tip_path(self.centre, rng),
-            substrate=self.centre.substrate,
-            gravity_mps2=self.centre.gravity_mps2,
-        )
-        return _with_grid(cfg, cell_m, solver)
+    inlet: str
+    solver: str
+    cell_mm: float
 
 
-def _with_grid(cfg: LaydownCfg, cell_m: float, solver: str) -> LaydownCfg:
-    clearance = float(np.clip(1.3 * run.expected_peak_m(cfg) + 2.5e-3, *_CLEARANCE_M))
-    clearance = (
-        math.ceil(clearance / 2e-3 - 1e-9) * 2e-3
-    )  # the same box for every cell size of the grid study
-    grid = replace(cfg.grid, cell_m=cell_m, solver=solver, clearance_m=clearance)
-    return replace(cfg, grid=grid)
-
-
-def jobs(draws: int, validation_draws: int) -> list[Job]:
-    """The data set's simulations, draw by draw.
+def bead(case: Case) -> LaydownCfg:
+    """The straight bead of the grid study.
 
     Args:
-        draws: For each training path.
-        validation_draws: For each validation path.
+        case: Grid and solver.
 
     Returns:
-        Jobs; those of the first draw come first.
+        The simulation.
     """
-    wanted = [Job("training", c, k, d) for d in range(draws) for k, c in enumerate(TRAINING)]
-    wanted += [Job("validation", c, k, d) for d in range(validation_draws) for k, c in enumerate(VALIDATION)]
-    return sorted(wanted, key=lambda job: job.draw)
+    path = TcpPath(
+        times_s=np.array([0.0, LENGTH_M / SPEED_MPS]),
+        positions=np.array([[0.0, 0.0, HEIGHT_M], [0.0, LENGTH_M, HEIGHT_M]]),
+        rotations=np.repeat(np.eye(3)[None], 2, 0),
+        flows_m3s=np.full(2, THESIS_FLOW_M3S),
+    )
+    grid = GridCfg(cell_m=1e-3 * case.cell_mm, solver=case.solver, inlet=case.inlet)  # type: ignore[arg-type]
+    return LaydownCfg(path=path, grid=grid)
 
 
-def _one(job: Job, options: argparse.Namespace) -> str | None:
-    """Computes a run if it is not there; the reason if it cannot be done."""
-    file = options.out / "runs" / f"{job.split}.{job.name}.npz"
-    failed = file.with_suffix(".failed")
-    if file.exists():
-        return None
-    try:
-        cfg = job.cfg(options.seed, options.cell * 1e-3, options.solver)
-        at = sections.stations(cfg)
-        bead = run.simulate(cfg, options.out / "cases" / f"{job.split}.{job.name}", limit_s=options.limit)
-    except LaydownError as error:
-        failed.write_text(f"{error}\n", encoding="utf-8")
-        return f"{job.name}: {str(error).splitlines()[0]}"
-    failed.unlink(missing_ok=True)
-    arrays = {key: getattr(at, key).astype(np.float32) for key in _SECTION_KEYS}
-    arrays |= {"hits_m": at.hits.astype(np.float32)}
-    for frame, rotation in (("tip", at.tips), ("across", at.across)):
-        images = sections.cut(bead.mesh, bead.fractions, at.hits, rotation)
-        arrays[f"images_{frame}"] = np.round(255.0 * images).astype(np.uint8)
-    ids = bead.mesh.cell_ids
-    whole = np.where(ids >= 0, np.clip(bead.fractions, 0, 1)[ids], 0.0)
-    facts = {
-        "centre_path": job.centre.name,
-        "substrate": job.centre.substrate,
-        "split": job.split,
-        "draw": job.draw,
-        "cells": len(bead.fractions),
-        "cell_mm": options.cell,
-        "solver": options.solver,
-        "volume_error": bead.volume_error,
-        "lid_fraction": bead.lid_fraction,
-        "cpu_s": round(bead.cpu_s, 2),
-        "path_s": round(float(cfg.path.times_s[-1]), 4),
+def lay(case: Case) -> Row:
+    """Lays the straight bead.
+
+    Args:
+        case: Grid and solver.
+
+    Returns:
+        A row of the table, and under ``section`` the mean of its steady cross-sections.
+    """
+    cfg = bead(case)
+    with tempfile.TemporaryDirectory() as folder:
+        laid = simulate(cfg, Path(folder) / "case", limit_s=_LIMIT_S)
+    at = sections.stations(cfg)
+    images = sections.cut(laid.mesh, laid.fractions, at.hits, at.tips)[STEADY]
+    areas = 1e6 * sections.area_m2(images)
+    return {
+        **asdict(case),
+        "cells": len(laid.fractions),
+        "area_mm2": float(areas.mean()),
+        "area_sd_mm2": float(areas.std()),
+        "ideal_mm2": 1e6 * float(at.ideal_m2[STEADY].mean()),
+        "width_mm": 1e3 * float(sections.width_m(images).mean()),
+        "height_mm": 1e3 * float(sections.height_m(images).mean()),
+        "volume_error_pct": 100.0 * laid.volume_error,
+        "lid_fraction": laid.lid_fraction,
+        "cpu_s": laid.cpu_s,
+        "section": np.round(images.mean(0), 4).tolist(),
     }
-    part = file.with_suffix(".part.npz")
-    np.savez_compressed(
-        part,
-        facts=np.array(json.dumps(facts)),
-        bead=np.round(255.0 * whole).astype(np.uint8),
-        solid=np.packbits(ids < 0),
-        origin=bead.mesh.origin,
-        **arrays,
+
+
+def compared(rows: list[Row]) -> list[Row]:
+    """Adds the intersection over union with the finest bead of the same inlet and solver, and across solvers.
+
+    Args:
+        rows: From ``lay``.
+
+    Returns:
+        Rows without sections, with ``iou_finest`` and ``iou_solvers`` (same cell and inlet, other solver).
+    """
+    out = []
+    for row in rows:
+        alike = [r for r in rows if r["inlet"] == row["inlet"]]
+        finest = min((r for r in alike if r["solver"] == row["solver"]), key=lambda r: float(r["cell_mm"]))
+        other = [r for r in alike if r["cell_mm"] == row["cell_mm"] and r["solver"] != row["solver"]]
+        mine = np.array(row["section"])
+        kept = {k: v for k, v in row.items() if k != "section"}
+        kept["iou_finest"] = float(sections.iou(mine, np.array(finest["section"])))
+        kept["iou_solvers"] = float(sections.iou(mine, np.array(other[0]["section"]))) if other else None
+        out.append(kept)
+    return out
+
+
+def markdown(rows: list[Row]) -> str:
+    """The grid study's table.
+
+    Args:
+        rows: From ``compared``.
+
+    Returns:
+        Markdown.
+    """
+    head = ["inlet", "solver", "cell mm", "area mm²", "width mm", "height mm", "IoU finest", "IoU solvers"]
+    head += ["volume error %", "CPU s"]
+    body = [
+        [
+            r["inlet"],
+            r["solver"],
+            f"{r['cell_mm']:g}",
+            f"{r['area_mm2']:.1f} ± {r['area_sd_mm2']:.1f}",
+            results.number(r["width_mm"], 1),
+            results.number(r["height_mm"], 2),
+            results.number(r["iou_finest"], 2),
+            results.number(r["iou_solvers"], 2),
+            results.number(r["volume_error_pct"], 2),
+            results.number(r["cpu_s"], 0),
+        ]
+        for r in rows
+    ]
+    fan_mm = 2e3 * HEIGHT_M * math.tan(math.radians(20.0))
+    return (
+        f"A fan of 40 deg, {1e3 * HEIGHT_M:g} mm above a plane, {SPEED_MPS:g} m/s: flow / speed is "
+        f"{rows[0]['ideal_mm2']:.1f} mm², the fan {fan_mm:.1f} mm wide. Area, width (where it is 0.5 mm "
+        "thick) and height are means of 18 sections 1 mm apart; IoU is of the mean section in 1 mm pixels: "
+        "with the same solver on the finest grid of that inlet, and with the other solver on the same "
+        "grid.\n\n" + results.grid(head, body)
     )
-    part.replace(file)
-    return None
 
 
-def do_runs(options: argparse.Namespace) -> str:
-    """Computes what is missing of the data set's simulations.
-
-    Args:
-        options: Of the command line.
-
-    Returns:
-        The report.
-    """
-    wanted = jobs(options.draws, options.validation_draws)
-    (options.out / "runs").mkdir(parents=True, exist_ok=True)
-    bad = []
-    with ThreadPoolExecutor(options.jobs) as pool:
-        done: Iterable[str | None] = pool.map(lambda job: _one(job, options), wanted)
-        for reason in tqdm(done, total=len(wanted), desc="laying beads", unit="run"):
-            if reason:
-                bad.append(reason)
-    lines = [f"{len(wanted) - len(bad)} of {len(wanted)} runs are complete", *bad]
-    return "\n".join(lines)
-
-
-def load(options: argparse.Namespace) -> list[tuple[Job, dict[str, Any], dict[str, Array]]]:
-    """Reads the complete runs.
-
-    Args:
-        options: Of the command line.
-
-    Returns:
-        Job, facts and arrays of each.
-
-    Raises:
-        LaydownError: If there are none.
-    """
-    found = []
-    for job in jobs(options.draws, options.validation_draws):
-        file = options.out / "runs" / f"{job.split}.{job.name}.npz"
-        if file.exists():
-            with np.load(file) as data:
-                arrays = {key: data[key] for key in data.files}
-            found.append((job, json.loads(str(arrays.pop("facts"))), arrays))
-    if not found:
-        raise LaydownError(f"{options.out / 'runs'} holds no runs: python -m experiments.laydown runs")
-    return found
+def _resumed(
+    wanted: list[Any], work: Callable[[Any], Row], log: Path, jobs: int, title: str
+) -> Iterator[tuple[Any, Row, bool]]:
+    """Each unit, its row, whether it was run now; a row is logged when the caller asks for the next."""
+    text = log.read_text(encoding="utf-8") if log.exists() else ""
+    done = {}
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue  # the line a killed run was writing
+        done[json.dumps(row.pop("unit"), sort_keys=True)] = row
+    keys = {unit: json.dumps(asdict(unit), sort_keys=True) for unit in wanted}
+    missing = [unit for unit in wanted if keys[unit] not in done]
+    for unit in wanted:
+        if keys[unit] in done:
+            yield unit, done[keys[unit]], False
+    start = len(wanted) - len(missing)
+    with (
+        log.open("a", encoding="utf-8") as file,
+        tqdm(total=len(wanted), initial=start, desc=title, unit="run") as bar,
+    ):
+        if text and not text.endswith("\n"):
+            file.write("\n")
+        for unit, row in engines.local(jobs)(work, missing):
+            yield unit, row, True
+            kept = {k: v for k, v in row.items() if k != laydown_data.ARRAYS}
+            file.write(json.dumps({"unit": asdict(unit), **kept}) + "\n")
+            file.flush()
+            bar.update()
 
 
-def do_sections(options: argparse.Namespace) -> str:
-    """Writes the data set from the complete runs.
+def grid(options: argparse.Namespace) -> str:
+    """Does the grid study.
 
     Args:
-        options: Of the command line.
+        options: With ``out``, ``jobs``, ``finest``.
 
     Returns:
-        The report.
+        The table.
     """
-    found = load(options)
-    rows = []
-    columns: dict[str, dict[str, list[Any]]] = {"training": {}, "validation": {}}
-    for job, facts, arrays in found:
-        arcs = arrays["arcs_m"]
-        inner = (arcs >= _END_M) & (arcs <= arcs[-1] - _END_M)
-        images = arrays["images_across"][inner] / 255.0
-        area, ideal = sections.area_m2(images), arrays["ideal_m2"][inner]
-        complete = abs(facts["volume_error"]) <= _WORST_VOLUME and facts["lid_fraction"] < 0.5
-        rows.append(
-            facts
-            | {
-                "sections": int(inner.sum()) if complete else 0,
-                "area_mm2": 1e6 * float(area.mean()),
-                "ideal_area_mm2": 1e6 * float(ideal.mean()),
-                "width_mm": 1e3 * float(sections.width_m(images).mean()),
-                "height_mm": 1e3 * float(sections.height_m(images).mean()),
-            }
-        )
-        if not complete:
-            continue
-        split = columns[job.split]
-        kept = {key: arrays[key] for key in (*_SECTION_KEYS, "images_tip", "images_across")}
-        n = len(arcs)
-        kept |= {
-            "inner": inner,
-            "centre_path": np.full(n, job.number, dtype=np.uint8),
-            "draw": np.full(n, job.draw, dtype=np.uint8),
-        }
-        for key, values in kept.items():
-            split.setdefault(key, []).append(values)
-    sizes = []
-    for name, centres in (("training", TRAINING), ("validation", VALIDATION)):
-        if columns[name]:
-            arrays = {key: np.concatenate(parts) for key, parts in columns[name].items()}
-            arrays["centre_path_names"] = np.array([c.name for c in centres])
-            file = options.out / f"laydown_{name}.npz"
-            np.savez_compressed(file, **arrays)
-            n = f"{int(arrays['inner'].sum())} sections inside {len(arrays['inner'])} stations"
-            sizes.append(f"{name}: {n}, {file.stat().st_size / 1e6:.2f} MB")
-    laydown_report.gallery(options.out / "laydown_runs.png", found)
-    laydown_report.atlas(options.out / "laydown_sections.png", found)
-    table = laydown_report.runs_table(rows)
+    cases = [
+        Case(inlet, solver, cell)
+        for inlet, cells in CELLS_MM.items()
+        for cell in cells
+        if cell >= options.finest
+        for solver in SOLVERS
+    ]
+    cases.sort(key=lambda c: -c.cell_mm)  # the cheap ones first
+    log = options.out / "laydown_grid.trials.jsonl"
+    found = {c: row for c, row, _ in _resumed(cases, lay, log, options.jobs, "grid")}
+    full = [found[c] for c in sorted(cases, key=lambda c: (c.inlet, c.solver, -c.cell_mm))]
+    rows = compared(full)
+    text = markdown(rows)
     results.write(
-        options.out,
-        "laydown_runs",
-        rows,
-        [],
-        renderer="none",
-        regime="static",
-        text=table,
-        more={"seed": options.seed},
-        module="laydown",
+        options.out, "laydown_grid", rows, [], renderer="none", regime="static", text=text, module=NAME
     )
-    return "\n".join([table, "", *sizes])
-
-
-def grid_cfg(cell_mm: float, solver: str) -> LaydownCfg:
-    """A straight bead on a plane.
-
-    Args:
-        cell_mm: Edge of a cell [mm].
-        solver: OpenFOAM's program.
-
-    Returns:
-        40 mm of it at 0.3 m/s, 30 mm above the plane.
-    """
-    return _with_grid(LaydownCfg(path=paths.tip_path(_STRAIGHT, _STRAIGHT_DRAWS)), cell_mm * 1e-3, solver)
-
-
-def do_grid(options: argparse.Namespace) -> str:
-    """Compares cell sizes and solvers.
-
-    Args:
-        options: Of the command line.
-
-    Returns:
-        The report.
-    """
-    folder = options.out / "grid"
-    folder.mkdir(parents=True, exist_ok=True)
-    found: dict[tuple[str, float], tuple[Array, dict[str, Any]]] = {}
-    wanted = [(cell, solver) for cell in options.cells for solver in ("interFoam", "interIsoFoam")]
-    for cell, solver in tqdm(wanted, desc="grids", unit="run"):
-        file = folder / f"{solver}.{cell:g}.npz"
-        if not file.exists():
-            cfg = grid_cfg(cell, solver)
-            at = sections.stations(cfg)
-            bead = run.simulate(cfg, folder / f"{solver}.{cell:g}", limit_s=options.limit)
-            images = sections.cut(bead.mesh, bead.fractions, at.hits, at.across)
-            facts = {
-                "cells": len(bead.fractions),
-                "volume_error": bead.volume_error,
-                "cpu_s": round(bead.cpu_s, 1),
-                "ideal_mm2": 1e6 * float(at.ideal_m2[0]),
-            }
-            np.savez_compressed(file, images=images, arcs_m=at.arcs_m, facts=np.array(json.dumps(facts)))
-        with np.load(file) as data:
-            arcs = data["arcs_m"]
-            inner = (arcs >= _END_M) & (arcs <= arcs[-1] - _END_M)
-            found[solver, cell] = data["images"][inner], json.loads(str(data["facts"]))
-    rows = laydown_report.grid_rows(found)
-    text = laydown_report.grid_table(rows)
-    results.write(
-        options.out, "laydown_grid", rows, [], renderer="none", regime="static", text=text, module="laydown"
-    )
-    laydown_report.grid_picture(options.out / "laydown_grid.png", found)
+    laydown_figures.grid(options.out / "laydown_grid.png", full)
     return text
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the command line.
+def runs(options: argparse.Namespace) -> str:
+    """Makes the surrogate's data.
+
+    Args:
+        options: With ``out``, ``jobs``, ``seed``, ``draws``, ``cell``, ``solver``.
+
+    Returns:
+        The table.
+    """
+    wanted = laydown_data.plan(options.draws, options.seed, options.cell, options.solver)
+    log = options.out / "laydown_runs.trials.jsonl"
+    rows = []
+    for run, row, new in _resumed(wanted, laydown_data.simulate_run, log, options.jobs, "runs"):
+        if new and row["error"] is None:
+            laydown_data.store(options.out / f"{run.path}.npz", run.draw, row[laydown_data.ARRAYS])
+        rows.append({**asdict(run), **{k: v for k, v in row.items() if k != laydown_data.ARRAYS}})
+    table = laydown_data.summary(rows)
+    text = laydown_data.markdown(table)
+    results.write(
+        options.out, "laydown_runs", table, rows, renderer="none", regime="static", text=text, module=NAME
+    )
+    return text
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Reads the command line.
 
     Args:
         arguments: Without the program's name; the process's own by default.
 
     Returns:
-        Exit status.
+        The options.
     """
-    parser = argparse.ArgumentParser(prog="python -m experiments.laydown", description=__doc__)
-    parser.add_argument("what", choices=("grid", "runs", "sections"))
-    parser.add_argument("--draws", type=int, default=4, help="of each training path (default: %(default)s)")
-    parser.add_argument(
-        "--validation-draws", type=int, default=1, help="of each validation path (default: %(default)s)"
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.laydown", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--cell", type=float, default=1.0, help="of the runs, mm (default: %(default)s)")
+    parser.add_argument("what", choices=("grid", "runs"), help="the grid study or the surrogate's data")
+    parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=1, help="simulations at a time (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawn paths (default: %(default)s)")
+    parser.add_argument("--draws", type=int, default=4, help="runs: of each path (default: %(default)s)")
     parser.add_argument(
-        "--cells",
-        type=float,
-        nargs="+",
-        default=_CELLS_MM,
-        help="of the grid study, mm (default: %(default)s)",
+        "--finest", type=float, default=0.5, help="grid: smallest cell [mm] (default: %(default)s)"
     )
-    parser.add_argument(
-        "--solver", default="interFoam", choices=("interFoam", "interIsoFoam"), help="of the runs"
-    )
-    parser.add_argument(
-        "--limit", type=float, default=3600.0, help="time for each run, s (default: %(default)s)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of the draws (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("out/laydown"), help="folder (default: %(default)s)")
-    options = command.checked(parser, arguments, draws=1, validation_draws=0, jobs=1, seed=0)
-    work = {"grid": do_grid, "runs": do_runs, "sections": do_sections}[options.what]
-    return command.run(lambda: work(options), options.out)
+    parser.add_argument("--cell", type=float, default=1.0, help="runs: cell [mm] (default: %(default)s)")
+    parser.add_argument("--solver", default=SOLVERS[0], choices=SOLVERS, help="runs: (default: %(default)s)")
+    options = command.checked(parser, arguments, jobs=1, seed=0, draws=1)
+    if not options.finest <= max(CELLS_MM["substrate"]):
+        parser.error(f"--finest {options.finest}: must be at most {max(CELLS_MM['substrate'])}")
+    return options
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the study or makes the data.
+
+    Args:
+        arguments: Without the program's name; the process's own by default.
+
+    Returns:
+        Exit status, see ``command.run``.
+    """
+    options = parse(arguments)
+
+    def do() -> str:
+        for solver in SOLVERS:
+            foam.find(solver)
+        return grid(options) if options.what == "grid" else runs(options)
+
+    return command.run(do, options.out)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,8 @@ _STACK = (
     "opencv-python-headless",
     "filterpy",
     "scikit-image",
+    "casadi",
+    "toppra",
     "torch",
     "stable-baselines3",
 )

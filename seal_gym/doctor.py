@@ -42,7 +42,8 @@ _PACKAGE = Path(__file__).parent
 
 # -- packages ---------------------------------------------------------------------------------------------
 
-_EXTRAS = ("sb3", "imitation", "ray", "viz")  # what users install; test and dev tools decide no result
+# What users install; test and dev tools decide no result.
+_EXTRAS = ("sb3", "imitation", "planning", "ray", "viz")
 
 
 class Package(NamedTuple):

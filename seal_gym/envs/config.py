@@ -10,6 +10,7 @@ from seal_gym.core.errors import ConfigError, is_number, require
 from seal_gym.envs.adapters import CONTROLS, LeafFunction, check_leaf_function
 from seal_gym.estimation.seam_rate import SEAM_RATE_GAIN
 from seal_gym.rmp import SealingCfg
+from seal_gym.sealant.config import SealantCfg
 from seal_gym.sim.look import LookCfg
 from seal_gym.tasks.progress import SealTaskCfg
 from seal_gym.tasks.reward import RewardCfg
@@ -59,7 +60,8 @@ class SealCfg:
             geometry through the calibrated cameras, without images.
         observation: ``"features"`` or ``"features+images"``.
         renderer: Of the sensor images: ``"raycast"`` (no GL) or ``"gl"``.
-        sealant: ``False``: this version simulates the gun's motion, not the sealant.
+        sealant: ``True`` or a ``SealantCfg`` lays sealant: the action gains a pressure, the observation the
+            bead that the side view shows, the metrics the bead; ``False``: the gun's motion only.
         leaves: Extra RMP leaves resolved with the policy's, with ``control="rmp"``.
         disturbances: What acts from outside, in any order (``seal_gym.wrappers``): configurations, names, or
             dictionaries as from JSON, e.g. ``{"name": "MovingWorkpiece", "severity": 1.0}``.
@@ -79,7 +81,7 @@ class SealCfg:
     perception: str = "vision"
     observation: str = "features"
     renderer: str = "raycast"
-    sealant: bool = False
+    sealant: bool | SealantCfg = False
     leaves: tuple[LeafFunction, ...] = ()
     disturbances: tuple[DisturbanceCfg, ...] = ()
     task: SealTaskCfg = field(default_factory=SealTaskCfg)
@@ -110,7 +112,12 @@ class SealCfg:
         )
         for leaf in self.leaves:
             check_leaf_function(leaf)
-        require(self.sealant is False, f"sealant = {self.sealant!r}: no sealant is simulated in this version")
+        require(
+            isinstance(self.sealant, bool | SealantCfg),
+            f"sealant = {self.sealant!r}: must be False, True or a SealantCfg",
+        )
+        if self.sealant is True:
+            object.__setattr__(self, "sealant", SealantCfg())
         _one_of("control", self.control, CONTROLS)
         _one_of("perception", self.perception, PERCEPTIONS)
         _one_of("observation", self.observation, OBSERVATIONS)
@@ -119,6 +126,10 @@ class SealCfg:
             not self.leaves or self.control == "rmp",
             f"leaves with control = {self.control!r}: only control='rmp' resolves leaves; use it or leave "
             "them out",
+        )
+        require(
+            not self.sealant or self.renderer == "raycast",
+            f"renderer = {self.renderer!r} with sealant: its sensor images show no bead; use 'raycast'",
         )
         _whole("threads", self.threads, 1, 256)
         require(

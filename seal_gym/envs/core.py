@@ -12,10 +12,13 @@ from seal_gym.core.frames import Array, axis_angle, cross, tip_rotation, transfo
 from seal_gym.core.kinematics import TipKinematics, tip_kinematics
 from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, check_leaf_function, make_adapter
 from seal_gym.envs.config import SealCfg
+from seal_gym.envs.extrusion import ROWS as SEALANT_ROWS
+from seal_gym.envs.extrusion import Extrusion
 from seal_gym.envs.sensors import Sensors
 from seal_gym.estimation.seam_rate import SeamRate
 from seal_gym.planning import ik
 from seal_gym.rmp import SeamErrors
+from seal_gym.sealant.config import SealantCfg
 from seal_gym.sim.arm import ArmBatch
 from seal_gym.sim.raycast import Images
 from seal_gym.sim.reach import check_reach
@@ -97,6 +100,8 @@ class SealCore:
         arm: The physics.
         lines: The seam's line in each view, as perception found it last.
         frames: Frames since each simulation's reset, shape (N,).
+        action_size: Of an action.
+        extrusion: Guns and beads; None without sealant.
     """
 
     def __init__(self, cfg: SealCfg, n: int) -> None:
@@ -121,7 +126,10 @@ class SealCore:
         self.adapter = make_adapter(cfg.control, cell, cfg.leaves, cfg.sealing)
         self.progress = Progress(self._seam, cell.process.stand_off_m, n, task)
         self.sensors = Sensors(self.scene, cfg, n)
-        self._disturbances = Disturbances(cfg.disturbances, n, self.adapter.size, self.scene)
+        laid = cfg.sealant
+        self.extrusion = Extrusion(cfg, laid, self.scene, n) if isinstance(laid, SealantCfg) else None
+        self.action_size = self.adapter.size + (self.extrusion is not None)
+        self._disturbances = Disturbances(cfg.disturbances, n, self.action_size, self.scene)
         self._views = ViewGeometry.of(cell)
         self._images: Images | None = None
         self._rate = SeamRate(n, cell.timing.frame_s, cfg.seam_rate_gain)
@@ -130,7 +138,7 @@ class SealCore:
         self.tip: TipKinematics = tip_kinematics(self.arm.q, self.arm.qd)
         self._command = self.tip
         self._tip_accel = np.zeros((n, 6))
-        self._action = np.zeros((n, self.adapter.size))
+        self._action = np.zeros((n, self.action_size))
         self._lean = np.zeros(n)
         self.frames = np.zeros(n, np.int64)
         start = self._seam.at(0.0)
@@ -139,6 +147,12 @@ class SealCore:
             start.position + cell.process.stand_off_m * start.approach,
         )
         self._vision = self._eyes() if cfg.perception == "vision" else None
+        self._lower, self._upper = _LOWER, _BOUND
+        if self.extrusion is not None:
+            self._lower = np.concatenate((_LOWER, np.zeros(len(SEALANT_ROWS))))
+            self._upper = np.concatenate((_BOUND, [bound for _, _, bound in SEALANT_ROWS]))
+            if self._vision is not None:
+                self.extrusion.watch(self.sensors.nozzle[1])
         self._lean_taught = float(np.arctan2(self._start[2, 0], self._start[2, 2]))
         nominal_s = self._seam.length / cell.process.speed_m_s
         self.time_limit = int(np.ceil(task.time_factor * nominal_s * cell.timing.frame_rate_hz))
@@ -153,6 +167,7 @@ class SealCore:
             cfg.vision,
             plate=self._start[2, :3],  # the part's z axis in the taught tip frame
             groove=GrooveCfg(width_m=width, depth_m=width) if width else None,
+            sealant_rgb=cfg.sealant.fluid.rgb if isinstance(cfg.sealant, SealantCfg) else None,
             threads=cfg.threads,
         )
 
@@ -161,12 +176,13 @@ class SealCore:
     @property
     def action_space(self) -> spaces.Box:
         """Of one environment."""
-        return spaces.Box(-1.0, 1.0, (self.adapter.size,), np.float32)
+        return spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
         """Of one environment."""
-        features = spaces.Box(_LOWER.astype(np.float32), _BOUND.astype(np.float32), dtype=np.float32)
+        low, high = self._lower.astype(np.float32), self._upper.astype(np.float32)
+        features = spaces.Box(low, high, dtype=np.float32)
         if self.cfg.observation == "features":
             return features
         images = {c.name: spaces.Box(0, 255, (c.height, c.width, 3), np.uint8) for c in self.cfg.cell.cameras}
@@ -201,6 +217,8 @@ class SealCore:
         self.frames[i] = 0
         if self.obstacle is not None:
             self.arm.place_obstacle(i, self.obstacle.position[i])
+        if self.extrusion is not None:
+            self.extrusion.reset(i, hovering[:3, 3], float(self.progress.s[i]), rng)
 
     def _hover(self, i: int, part_pose: Array, rng: np.random.Generator) -> Array:
         """Puts the gun in a hover where it touches nothing; gives ``T_part_tip``."""
@@ -250,12 +268,16 @@ class SealCore:
             ActionError: If the action has a wrong shape or is not finite.
         """
         action = self._checked(action)
-        qdd = self.adapter(self._disturbances.delayed(action), self.arm_state())
+        delayed = self._disturbances.delayed(action)
+        qdd = self.adapter(delayed[:, : self.adapter.size], self.arm_state())
         touched = self.arm.step(qdd, self._disturbances.outside(self.frames, self.progress.s))
         self.frames += 1
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
         self.progress.advance(self.tip_in_part(), self._seam_speed())
+        if self.extrusion is not None:
+            turn = np.swapaxes(self.arm.part_pose[:, :3, :3], 1, 2) @ self.tip.pose[:, :3, :3]
+            self.extrusion.step(delayed[:, -1], self.tip_in_part(), turn, self.progress.s)
         return self._judge(touched, action, before, error)
 
     def observe(self, rows: NDArray[np.bool_] | None = None) -> Observation:
@@ -278,7 +300,7 @@ class SealCore:
     # -- the parts of a step ----------------------------------------------------------------------------
 
     def _checked(self, action: NDArray[Any]) -> Array:
-        action = as_action(action, (self.n, self.adapter.size), self.cfg.control)
+        action = as_action(action, (self.n, self.action_size), self.cfg.control)
         if not np.isfinite(action).all():
             bad = np.argwhere(~np.isfinite(action))[0].tolist()
             raise ActionError(
@@ -339,6 +361,8 @@ class SealCore:
             touched | lost,
             self.cfg.reward,
         )
+        if self.extrusion is not None:
+            value = value + self.extrusion.reward()
         return StepResult(value, reached, touched, lost, timeout)
 
     def _seam_lines(self, rows: NDArray[np.bool_] | None) -> SeamLines:
@@ -353,7 +377,8 @@ class SealCore:
     def _exposed(self) -> Images:
         """The images as the cameras take them now."""
         self._disturbances.illuminate(self.sensors.look, self.frames)
-        return self.sensors.images(self._disturbances.bracket(self.tip.pose), self.arm, self.frames)
+        bead = None if self.extrusion is None else self.extrusion.view()
+        return self.sensors.images(self._disturbances.bracket(self.tip.pose), self.arm, self.frames, bead)
 
     def _look(self) -> Images:
         """The images as they arrive now."""
@@ -371,9 +396,11 @@ class SealCore:
         )
         lean = np.arctan2(self.tip.pose[:, 2, 0], self.tip.pose[:, 2, 2]) - self._lean_taught
         self._lean = np.mod(lean + np.pi, 2 * np.pi) - np.pi
+        if self.extrusion is not None:
+            self.extrusion.look(None if self._images is None else self._images.side, rows)
 
     def _feature_rows(self) -> NDArray[np.float32]:
-        f, rows = self.features, np.empty((self.n, FEATURES))
+        f, rows = self.features, np.empty((self.n, len(self._lower)))
         rows[:, 0], rows[:, 3] = _MM * f.d_m[:, 0], _MM * f.d_m[:, 1]
         rows[:, 1], rows[:, 4] = _DEG * f.theta_rad[:, 0], _DEG * f.theta_rad[:, 1]
         rows[:, 2], rows[:, 5] = f.valid[:, 0], f.valid[:, 1]
@@ -383,7 +410,9 @@ class SealCore:
         rows[:, 17:23] = self._tip_accel
         rows[:, 23:29] = self.arm.q
         rows[:, 29:35] = self.arm.qd
-        return np.asarray(np.minimum(np.maximum(rows, _LOWER), _BOUND), dtype=np.float32)
+        if self.extrusion is not None:
+            rows[:, FEATURES:] = self.extrusion.rows()
+        return np.asarray(np.minimum(np.maximum(rows, self._lower), self._upper), dtype=np.float32)
 
     # -- what others may ask ----------------------------------------------------------------------------
 
@@ -494,6 +523,7 @@ class SealCore:
             "timeout": outcome in ("timeout", "lost"),
             **metrics,
             "time_s": self.seconds(i),
+            **({} if self.extrusion is None else self.extrusion.metrics(i)),
         }
 
     def info(self, i: int, result: StepResult | None) -> dict[str, Any]:
@@ -525,6 +555,8 @@ class SealCore:
             info["disturbances"] = self.recorded()
         if self.obstacle is not None:
             info["obstacle"] = obstacle_info(self.obstacle, i)
+        if self.extrusion is not None:
+            info["sealant"] = self.extrusion.info(i)
         if result is not None and (result.terminated[i] or result.timeout[i]):
             info["episode_metrics"] = self.episode_metrics(i, result)
         return info

@@ -56,6 +56,9 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     With ``"rmp"`` the policy's leaf is resolved with fixed leaves: damping against the reference twist,
     regularisation, lean, joint limits, and any leaf passed as ``leaves`` or added with ``add_leaf``.
 
+    With ``sealant`` one more entry, the last: the gun's pressure, -1 none, 1 ``GunCfg.pressure_max_pa`` (150
+    kPa), which the nozzle sees behind a first-order lag of 80 ms.
+
     ## Observation space
 
     ``observation="features"``: a ``Box`` of 35 float32, clipped to +-max:
@@ -78,6 +81,14 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     | 23-28 | joint angles | rad | 10 |
     | 29-34 | joint speeds | rad/s | 10 |
 
+    With ``sealant`` three more entries:
+
+    | index | name | unit | max |
+    | --- | --- | --- | --- |
+    | 35 | pressure at the nozzle | kPa | 2000 |
+    | 36 | width of the bead 3.6-5.2 mm behind the nozzle, in the side view | mm | 50 |
+    | 37 | bead seen | 0 or 1 | 1 |
+
     ``observation="features+images"``: a ``Dict`` with ``features`` as above and the ROIs ``front``
     (100, 50, 3) and ``side`` (50, 100, 3), uint8 RGB.
 
@@ -86,6 +97,8 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     See ``seal_gym.tasks.reward``: new ground along the seam in nominal steps (at most 1) times the tracking
     quality 1 / (1 + (e / 1 mm)^2), a potential of the tip error, small penalties for heading error and for
     jumps of the action, +20 for a sealed seam and -20 for a collision or a lost seam. Bounded by +-23.15.
+    ``SealantCfg(reward=w)`` takes off w times the relative error of the bead's section behind the tip, at
+    most w a step.
 
     ## Episode end
 
@@ -102,6 +115,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     at an episode's end ``episode_metrics``: ``outcome``, ``reached``, ``collision``, ``timeout`` (lost
     included), ``rmse_mm`` (None before 10 mm of travel), ``rmse_whole_mm``, ``coverage_pct``, ``time_s``,
     and on moving parts ``seam_speed_mm_s``. Errors are those against the seam where it is at that instant.
+    With sealant ``sealant`` (``Extrusion.info``), and in ``episode_metrics`` the bead's (``Bead.metrics``).
 
     ## Arguments
 
@@ -175,7 +189,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         if not self._running:
             raise gym.error.ResetNeeded("call reset() before step()")
         core = self.core
-        result: StepResult = core.step(as_action(action, (core.adapter.size,), core.cfg.control)[None])
+        result: StepResult = core.step(as_action(action, (core.action_size,), core.cfg.control)[None])
         ended, self._ended = self._ended, self._ended or bool(result.terminated[0] or result.timeout[0])
         observation = first(core.observe())
         self._show()

@@ -11,6 +11,7 @@ from seal_gym.envs.config import SealCfg
 from seal_gym.sim.arm import ArmBatch
 from seal_gym.sim.look import Look
 from seal_gym.sim.raycast import Images, Raycaster
+from seal_gym.sim.raycast_bead import BeadView
 from seal_gym.sim.scene import Scene
 
 
@@ -55,20 +56,26 @@ class Sensors:
         if self._mirrored:
             self.look.lamp[i, 0] *= -1.0
 
-    def images(self, tip_pose: Array, arm: ArmBatch, frame: NDArray[np.int64]) -> Images:
+    def images(
+        self, tip_pose: Array, arm: ArmBatch, frame: NDArray[np.int64], bead: BeadView | None = None
+    ) -> Images:
         """Both ROIs of all simulations.
 
         Args:
             tip_pose: ``T_base_tip``, shape (N, 4, 4), m.
             arm: The physics: where the parts are.
             frame: Number of the frame in its episode, shape (N,): the same frame has the same noise.
+            bead: Sealant on the parts; the raycaster alone draws it.
 
         Returns:
             The images and their signal-to-noise ratio.
         """
-        out = self._renderer.render(
-            tip_pose, arm.part_pose, self.look, frame.astype(np.uint64), self._cfg.threads
-        )
+        renderer, counters = self._renderer, frame.astype(np.uint64)
+        threads = self._cfg.threads
+        if isinstance(renderer, Raycaster):
+            out = renderer.render(tip_pose, arm.part_pose, self.look, counters, threads, bead)
+        else:
+            out = renderer.render(tip_pose, arm.part_pose, self.look, counters, threads)
         self.snr_db = out.snr_db
         return out
 

@@ -221,6 +221,8 @@ class SealVectorEnv(VectorEnv, EzPickle):
                 "velocity_m_s": o.velocity,
                 "radius_m": np.full(n, o.radius),
             }
+        if core.extrusion is not None:
+            values["sealant"] = core.extrusion.infos()
         info = _masked(values, shown)
         if result is not None:
             for i in np.flatnonzero(self._ended):

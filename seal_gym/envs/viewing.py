@@ -33,6 +33,7 @@ _COLUMNS = (0, 82, 172, 272, 352)
 _TRAIL_RGBA = np.array([1.0, 0.45, 0.10, 1.0], np.float32)
 _TRAIL_STEP_M = 2e-3
 _TRAIL_RADIUS_M = 8e-4
+_BEAD_STEP_M = 2e-3
 # Viewing direction of the close-up in the tip frame.
 _CLOSE_VIEW = normalise(np.array([-0.34, -0.62, -0.72]))
 
@@ -117,7 +118,7 @@ class SceneView:
     def picture(self) -> NDArray[np.uint8]:
         """The nozzle from ahead on its free side; beside it what the cameras saw, and the whole cell.
 
-        The orange trail is the way of the nozzle mouth on the part.
+        The orange trail is the way of the nozzle mouth on the part; with sealant, the bead in its place.
 
         Returns:
             Shape (720, 1280, 3), RGB.
@@ -199,7 +200,10 @@ class SceneView:
         option.geomgroup[GROUP_COLLISION] = 0
         option.sitegroup[:] = 0
         renderer.update_scene(self._core.arm.data(0), camera=camera, scene_option=option)
-        self._draw_trail(renderer.scene)
+        if self._core.extrusion is None:
+            self._draw_trail(renderer.scene)
+        else:
+            self._draw_bead(renderer.scene)
         return np.asarray(renderer.render())
 
     def _wide(self) -> mujoco.MjvCamera:
@@ -239,6 +243,24 @@ class SceneView:
             capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
             mujoco.mjv_initGeom(geom, int(capsule), np.zeros(3), np.zeros(3), np.eye(3).ravel(), _TRAIL_RGBA)
             mujoco.mjv_connector(geom, int(capsule), _TRAIL_RADIUS_M, a, b)
+            scene.ngeom += 1
+
+    def _draw_bead(self, scene: mujoco.MjvScene) -> None:
+        """The bead as capsules through its sections' middles, as thick as these are large."""
+        extrusion = self._core.extrusion
+        assert extrusion is not None
+        part, rgba = self._core.arm.part_pose[0], np.array([*extrusion.cfg.fluid.rgb, 1.0], np.float32)
+        middle, radius = extrusion.bead.spine(0, _BEAD_STEP_M)
+        points = middle @ part[:3, :3].T + part[:3, 3]
+        for (a, b), (r, s) in zip(pairwise(points), pairwise(radius), strict=True):
+            if min(r, s) <= 0.0:
+                continue
+            if scene.ngeom >= scene.maxgeom:
+                return
+            geom = scene.geoms[scene.ngeom]
+            capsule = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+            mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
+            mujoco.mjv_connector(geom, capsule, 0.5 * (r + s), a, b)
             scene.ngeom += 1
 
     def sync(self) -> None:

@@ -1,1 +1,1 @@
-"""Inverse kinematics. Arrays in, arrays out; knows nothing of MuJoCo or Gymnasium."""
+"""Inverse kinematics and motions to a goal. Arrays in, arrays out; knows nothing of MuJoCo or Gymnasium."""

@@ -6,11 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seal_gym.core.frames import Array, transform
-from seal_gym.core.kinematics import DH_A, DH_COS_ALPHA, DH_D, DH_SIN_ALPHA, T_TOOL0_TIP
+from seal_gym.core.kinematics import (
+    DH_A,
+    DH_COS_ALPHA,
+    DH_D,
+    DH_SIN_ALPHA,
+    JOINT_LOWER,
+    JOINT_UPPER,
+    T_TOOL0_TIP,
+)
 
 # Branch index = 4 shoulder + 2 wrist + elbow; 0 and 1 choose the sign of each square root.
 BRANCHES = 8
 _SINGULAR = 1e-9
+_TURN = 2.0 * np.pi
+_STOPPED_RAD = 1e-9  # a joint that a limit moved is not the solution's any more
 
 
 def _link(k: int, angle: NDArray[np.floating[Any]]) -> Array:
@@ -100,3 +110,45 @@ def nearest(solutions: Array, reference: Array) -> Array:
     distance = np.sum((unwrapped - reference) ** 2, axis=-1)
     best = np.argmin(np.where(np.isnan(distance), np.inf, distance), axis=-1)
     return np.take_along_axis(unwrapped, best[..., None, None], axis=-2)[..., 0, :]
+
+
+def within(q: Array, lower: Array, upper: Array) -> Array:
+    """The same postures within limits: by whole turns where that does, else at the nearest limit.
+
+    Args:
+        q: Shape (..., d), rad.
+        lower: Shape (d,), rad.
+        upper: Shape (d,), rad.
+
+    Returns:
+        Shape (..., d), rad.
+    """
+    outside = (q < lower) | (q > upper)
+    # Of the turns that end within, the one closest to the limit that was passed.
+    turned = np.where(
+        q > upper, q - _TURN * np.ceil((q - upper) / _TURN), q + _TURN * np.ceil((lower - q) / _TURN)
+    )
+    fits = outside & (turned >= lower) & (turned <= upper)
+    return np.where(fits, turned, np.clip(q, lower, upper))
+
+
+def nearest_within(
+    solutions: Array, reference: Array, lower: Array = JOINT_LOWER, upper: Array = JOINT_UPPER
+) -> Array:
+    """The solution closest to a posture among those that whole turns of joints bring within limits.
+
+    Args:
+        solutions: From ``solve``, shape (..., 8, 6), rad.
+        reference: Posture to stay near, shape (6,), rad.
+        lower: Smallest joint angles, shape (6,), rad.
+        upper: Largest joint angles, shape (6,), rad.
+
+    Returns:
+        Shape (..., 6), rad; NaN where no branch reaches the pose within the limits.
+    """
+    turned = within(reference + _wrap(solutions - reference), lower, upper)
+    stopped = np.abs(_wrap(turned - solutions)).max(axis=-1) > _STOPPED_RAD
+    distance = np.where(stopped, np.nan, np.sum((turned - reference) ** 2, axis=-1))
+    best = np.argmin(np.where(np.isnan(distance), np.inf, distance), axis=-1)[..., None]
+    chosen = np.take_along_axis(turned, best[..., None], axis=-2)[..., 0, :]
+    return np.where(np.isnan(np.take_along_axis(distance, best, axis=-1)), np.nan, chosen)

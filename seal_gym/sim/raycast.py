@@ -18,6 +18,7 @@ from seal_gym.core.jit import kernel
 from seal_gym.core.parallel import split
 from seal_gym.sim import texture
 from seal_gym.sim.look import MAX_BLUR_PX, Look
+from seal_gym.sim.raycast_bead import BeadView, draw_bead
 from seal_gym.sim.raycast_extras import cast_shadow, draw_ball
 from seal_gym.workpieces.surface import MATERIALS, Surface
 
@@ -55,6 +56,7 @@ _ADD_LANES = np.uint64(0x0001000100010001)
 _BYTES_MEAN = 1020.0
 _PER_BYTES_SIGMA = 1.0 / math.sqrt(43690.0)
 _THIRD = 1.0 / 3.0
+_NO_BEAD = BeadView.none()
 
 
 class Images(NamedTuple):
@@ -695,6 +697,7 @@ def _render_batch(
     part: Array,
     first: int,
     last: int,
+    bead: BeadView,
     shown: _Shown,
     b: _Buffers,
     out: Bytes,
@@ -723,6 +726,8 @@ def _render_batch(
             edges,
         )
         _paint(mesh.grain, view, shown.face, look, row, b)
+        if len(bead.height) > 0:
+            draw_bead(bead, row, rot, eye, lamp, view, look, b.near, b.picture)
         if look.shadow[row, 5] > 0.0:
             cast_shadow(b.near, view.rotation, view.position, ray_x, ray_y, look.shadow[row], b.picture)
         _paint_nozzle(view.alpha, view.tool_normal, view.tool_albedo, look, row, b.picture)
@@ -925,7 +930,13 @@ class Raycaster:
         return self._views[0].alpha.copy(), self._views[1].alpha.copy()
 
     def render(
-        self, tip_pose: Array, part_pose: Array, look: Look, frame: Counters, threads: int = 1
+        self,
+        tip_pose: Array,
+        part_pose: Array,
+        look: Look,
+        frame: Counters,
+        threads: int = 1,
+        bead: BeadView | None = None,
     ) -> Images:
         """Draws both views of N simulations.
 
@@ -935,6 +946,7 @@ class Raycaster:
             look: Lamp, exposure, noise and texture of each simulation.
             frame: Frame counters, shape (N,): the noise is a function of seed, frame, view and pixel.
             threads: Splits the batch; the images are the same for any number.
+            bead: Sealant on the parts; by default none.
 
         Returns:
             The images and their signal-to-noise ratios.
@@ -956,11 +968,14 @@ class Raycaster:
         counters = np.ascontiguousarray(frame, dtype=np.uint64)
         images = [np.empty((n, len(v.ray_y), len(v.ray_x), 3), np.uint8) for v in self._views]
         variance = np.empty((2, n))
+        beads = _NO_BEAD if bead is None else bead
 
         def draw(first: int, last: int) -> None:
             rooms = self._take_rooms()
             for view, room, image, var in zip(self._views, rooms, images, variance, strict=True):
-                _render_batch(self._mesh, view, look, counters, tip, part, first, last, *room, image, var)
+                _render_batch(
+                    self._mesh, view, look, counters, tip, part, first, last, beads, *room, image, var
+                )
             self._rooms.append(rooms)
 
         split(draw, n, threads)

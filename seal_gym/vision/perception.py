@@ -27,6 +27,7 @@ from seal_gym.core.jit import kernel
 from seal_gym.core.parallel import split
 from seal_gym.vision.edges import EdgeDetector, EdgeTables, edge_image
 from seal_gym.vision.features import SeamLines, ViewGeometry
+from seal_gym.vision.fresh_bead import colour_weights, hide_sealant
 from seal_gym.vision.groove import SECTION, GrooveCfg, section_of
 from seal_gym.vision.seam_line import (
     LineNumbers,
@@ -308,8 +309,8 @@ def _start(
 def _perceive(
     front: Bytes,
     side: Bytes,
-    mask_front: Bools,
-    mask_side: Bools,
+    masks_front: Bools,
+    masks_side: Bools,
     tips: Array,
     rows: Bools,
     ref: Array,
@@ -331,6 +332,8 @@ def _perceive(
         if not rows[i]:
             continue
         tip = tips[i]
+        # One mask for all, or one each.
+        mask_front, mask_side = masks_front[i % len(masks_front)], masks_side[i % len(masks_side)]
         found = False
         if state.tracking[i]:
             found = _track(
@@ -382,6 +385,8 @@ class Perception:
         plate: Normal of the plate in the tip frame of a gun held as taught, shape (3,); by default a nozzle
             that halves the right angle between the plate and a wall on the left.
         groove: The seam's section, if the seam is the middle of a groove and not the foot of a wall.
+        sealant_rgb: Colour of the sealant that the gun lays, which the tracker is not to follow, 3 numbers in
+            0..1; None if it lays none.
         detector: Finds the edges in place of the fractional-order stage.
         threads: Splits the batch; the lines are the same for any number.
     """
@@ -396,6 +401,7 @@ class Perception:
         *,
         plate: Array | None = None,
         groove: GrooveCfg | None = None,
+        sealant_rgb: tuple[float, float, float] | None = None,
         detector: EdgeDetector | None = None,
         threads: int = 1,
     ) -> None:
@@ -408,11 +414,12 @@ class Perception:
         self._n, self._threads, self._detector = n, threads, detector
         self._views = ViewGeometry(*(np.ascontiguousarray(x, np.float64) for x in views))
         self._masks = dilated(nozzle)
+        self._weights = None if sealant_rgb is None else colour_weights(sealant_rgb)
         ref = views.reference
         self._reference = np.array([[views.size[0, 1] - ref[0, 1], ref[0, 0]], ref[1]])
         self._edges, self._line = EdgeTables.of(cfg.edges), cfg.line.numbers
         plate = _FILLET_PLATE if plate is None else plate
-        self._par = TrackNumbers.of(cfg, frame_s, plate, groove)
+        self._par = TrackNumbers.of(cfg, frame_s, plate, groove, sealant_rgb is not None)
         # With the wall on the right the seam's dark and bright sides change places in both views. A
         # groove is dark whichever way the gun leans.
         self._negative = bool(plate[0] > 1e-6) and groove is None
@@ -470,6 +477,7 @@ class Perception:
             The seam's lines; arrays of the caller's own. A view that has not shown the seam for the
             coasting time is invalid.
         """
+        masks = self._hidden(front, side)
         if self._negative:
             front, side = 255 - front, 255 - side
         images = np.ascontiguousarray(front), np.ascontiguousarray(side)
@@ -481,7 +489,7 @@ class Perception:
             room = self._take_room()
             _perceive(
                 *images,
-                *self._masks,
+                *masks,
                 tips,
                 fresh,
                 self._reference,
@@ -501,6 +509,17 @@ class Perception:
         split(look, self._n, self._threads)
         point, direction, valid = self._lines
         return SeamLines(point.copy(), direction.copy(), valid.copy())
+
+    def _hidden(self, front: Bytes, side: Bytes) -> tuple[Bools, Bools]:
+        """What the tracker must not look at, shape (1 or N, length, width) each."""
+        if self._weights is None:
+            return self._masks[0][None], self._masks[1][None]
+        out = []
+        for view, (raw, nozzle) in enumerate(zip((front, side), self._masks, strict=True)):
+            masks = np.empty((self._n, *nozzle.shape), np.bool_)
+            hide_sealant(np.ascontiguousarray(raw), self._weights, view, nozzle, masks)
+            out.append(masks)
+        return out[0], out[1]
 
     def _detected(self, front: Bytes, side: Bytes) -> EdgeMaps:
         if self._detector is None:

@@ -117,9 +117,12 @@ class TrackNumbers(NamedTuple):
     along_gain: float
     plate: tuple[float, float, float]
     groove: tuple[float, float, float]
+    lays: bool  # whether the gun lays sealant, which hides the seam beside the tip
 
     @classmethod
-    def of(cls, cfg: PerceptionCfg, frame_s: float, plate: Array, groove: GrooveCfg | None) -> "TrackNumbers":
+    def of(
+        cls, cfg: PerceptionCfg, frame_s: float, plate: Array, groove: GrooveCfg | None, lays: bool = False
+    ) -> "TrackNumbers":
         """Takes the numbers from a configuration.
 
         Args:
@@ -127,6 +130,7 @@ class TrackNumbers(NamedTuple):
             frame_s: Duration of a frame [s].
             plate: Normal of the plate in the tip frame, shape (3,).
             groove: The seam's section; None if the seam is an edge.
+            lays: Whether the gun lays sealant.
 
         Returns:
             The numbers.
@@ -147,6 +151,7 @@ class TrackNumbers(NamedTuple):
             search=cfg.search_s / frame_s + 1e-9,
             plate=(x, y, z),
             groove=groove.numbers if groove else NO_GROOVE,
+            lays=lays,
         )
 
 

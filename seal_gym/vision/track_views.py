@@ -218,6 +218,18 @@ def _reach(section: Array, q: float, par: TrackNumbers) -> float:
 
 
 @kernel
+def _past_sealant(mask: Bools, line: Array, skip: float, most: float) -> float:
+    """The first row from ``skip`` on in which the expected line is not under the paste before the nozzle."""
+    height, width = mask.shape
+    for step in range(int(most)):
+        row = int(line[0] + skip) + step
+        column = int(line[1] + line[2] * (row + 0.5 - line[0]))
+        if not (0 <= row < height and 0 <= column < width and mask[row, column]):
+            return float(skip + step)
+    return skip
+
+
+@kernel
 def _side_residual(
     mask: Bools,
     g: ViewGeometry,
@@ -243,6 +255,8 @@ def _side_residual(
     # Above the plate the seam may come into the ROI only ahead of the tip.
     below = line[1] - (mask.shape[1] - _HIDDEN)
     skip = min(-below / line[2], float(mask.shape[0])) if below > 0.0 and line[2] < -1e-3 else 0.0
+    if par.lays:
+        skip = _past_sealant(mask, line, skip, par.side_px)
     reach = _reach(section, line[2], par)
     first = int(line[0] + skip - par.side_px)
     for row in range(first, int(line[0] + skip + par.side_px) + 1):
@@ -290,7 +304,7 @@ def _kalman(variance: Array, k: int, drift: float, error: float, noise: float, g
 
 
 @kernel
-def track_side(
+def track_side(  # noqa: PLR0911  # each return is a reason not to have seen the seam
     i: int,
     mask: Bools,
     g: ViewGeometry,
@@ -312,8 +326,12 @@ def track_side(
         return False
     if not _usual(i, 1, mask, line, 0, section, par, state, s):
         return False
+    # Under its own paste the gun sees rows further ahead only, which a bend turns away: until it is over, the
+    # plate's plane in the world has to do.
+    if par.lays and abs(bend) >= _BENT:
+        return True
     if not _side_residual(mask, g, lp, par, s, p, d, m, section, bend, line, per_m[0], out):
-        return False
+        return par.lays
     # Neighbouring rows share pixels: five times the variance of independent ones.
     noise = 5.0 * par.row_sigma_m**2
     r_height = noise * out[2] + _HEIGHT_FLOOR**2
@@ -326,7 +344,7 @@ def track_side(
     if height == 0.0:
         return False
     # Where the seam bends the side view mixes bend and pitch, and plates bend seldom where seams do.
-    drift = par.pitch_q_rad if abs(bend) < _BENT else _BENT_SHARE * par.pitch_q_rad
+    drift = par.pitch_q_rad if abs(bend) < _BENT and not par.lays else _BENT_SHARE * par.pitch_q_rad
     pitch = _kalman(variance, 1, drift, out[1] / per_m[1] * per_m[0], r_pitch, par.gate)
     height -= pitch * out[4] / per_m[0]
     for k in range(3):

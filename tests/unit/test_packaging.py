@@ -49,7 +49,7 @@ def test_installed_version_is_the_checkouts() -> None:
 
 
 def test_all_leaves_ray_out_because_its_gymnasium_conflicts_with_imitations() -> None:
-    assert PROJECT["optional-dependencies"]["all"] == ["seal-gym[sb3,imitation,viz]"]
+    assert PROJECT["optional-dependencies"]["all"] == ["seal-gym[sb3,imitation,planning,viz]"]
 
 
 def test_next_major_mujoco_is_capped() -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown import foam, jet
 from seal_gym.sealant.laydown import mesh as meshes
 from seal_gym.sealant.laydown.config import FluidCfg, GridCfg, LaydownCfg
@@ -31,6 +32,9 @@ def build_mesh(cfg: LaydownCfg) -> Mesh:
     """
     part, grid = SUBSTRATES[cfg.substrate], cfg.grid
     place = jet.landings(cfg)[2][:, :2]
+    if grid.inlet == "top":
+        lid = jet.landings(cfg, lambda x, y: part.height(x, y) + grid.clearance_m)[2]
+        place = np.vstack((place, lid[:, :2]))
     return meshes.build(
         part, place.min(0) - grid.margin_m, place.max(0) + grid.margin_m, grid.clearance_m, grid.cell_m
     )
@@ -45,12 +49,13 @@ def transport(fluid: FluidCfg) -> dict[str, Entry]:
     Returns:
         Entries.
     """
-    rho = fluid.density_kgpm3
+    material = fluid.sealant
+    rho = material.density_kg_m3
     model: dict[str, Entry] = {
         "nu0": fluid.viscosity_cap_pas / rho,
-        "tau0": fluid.yield_stress_pa / rho,
-        "k": fluid.consistency_pasn / rho,
-        "n": float(fluid.flow_index),
+        "tau0": material.yield_stress_pa / rho,
+        "k": material.consistency_pa_sn / rho,
+        "n": float(material.flow_index),
     }
     sealant: dict[str, Entry] = {
         "transportModel": "HerschelBulkley",
@@ -90,7 +95,7 @@ def control(grid: GridCfg, end_s: float) -> dict[str, Entry]:
         "adjustTimeStep": "yes",
         "maxCo": float(grid.courant),
         "maxAlphaCo": float(grid.courant),
-        "maxDeltaT": grid.inlet_dt_s,
+        "maxDeltaT": 0.5 * grid.inlet_dt_s,
         "runTimeModifiable": "no",
     }
 
@@ -122,7 +127,7 @@ def schemes(grid: GridCfg) -> dict[str, Entry]:
 
 
 def solution(grid: GridCfg, *, skewed: bool) -> dict[str, Entry]:
-    """``fvSolution``: the momentum equation is solved implicitly, for its viscous term is far stiffer than the step.
+    """``fvSolution``: momentum is implicit, for its viscous term is far stiffer than the step.
 
     Args:
         grid: Solver.
@@ -200,15 +205,46 @@ def _write_mesh(mesh: Mesh, folder: Path) -> None:
     )
 
 
-def _write_inflow(flow: jet.Inflow, mesh: Mesh, folder: Path) -> None:
-    centres, areas = mesh.faces_of("substrate")
-    inward = -areas / (areas**2).sum(1, keepdims=True)  # so that velocity . area = -flow
+def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path, *, fractions: bool) -> None:
     folder.mkdir(parents=True)
     (folder / "points").write_text(foam.values(centres))
-    for time, through in zip(flow.times_s, flow.flows_m3s, strict=True):
+    wet = flow.flows_m3s > 0
+    wet = (
+        wet | np.roll(wet, 1, 0) | np.roll(wet, -1, 0)
+    )  # nothing flows at either end, so nothing wraps around
+    for time, velocity, full in zip(flow.times_s, flow.velocities, wet, strict=True):
         at = folder / f"{time:.9g}"
         at.mkdir()
-        (at / "U").write_text(foam.values(inward * through[:, None]))
+        (at / "U").write_text(foam.values(velocity))
+        if fractions:
+            (at / f"alpha.{FLUID}").write_text(foam.values(full.astype(float)))
+
+
+def _boundaries(inlet: str) -> dict[str, tuple[str, str, dict[str, Entry]]]:
+    """Dimensions, initial value and boundary conditions of each field."""
+    free: Entry = {"type": "pressureInletOutletVelocity", "value": "uniform (0 0 0)"}
+    air: Entry = {"type": "totalPressure", "p0": "uniform 0", "value": "uniform 0"}
+    given: Entry = {"type": "fixedFluxPressure", "value": "uniform 0"}
+    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": "off"}
+    jets: Entry = mapped | {"value": "uniform (0 0 0)"}
+    alpha = f"alpha.{FLUID}"
+    velocity: dict[str, Entry] = {"top": free, "sides": free, "substrate": jets}
+    # To the fluid the wall is full of sealant: what comes out of it is, and what lies on it sticks to it.
+    fraction: dict[str, Entry] = {
+        "top": _OPEN,
+        "sides": _OPEN,
+        "substrate": {"type": "fixedValue", "value": "uniform 1"},
+    }
+    pressure: dict[str, Entry] = {"top": air, "sides": air, "substrate": given}
+    if inlet == "top":
+        velocity |= {"top": jets, "substrate": {"type": "noSlip"}}
+        fraction |= {"top": mapped | {"value": "uniform 0"}, "substrate": {"type": "zeroGradient"}}
+        pressure |= {"top": given}
+    return {
+        "U": ("[0 1 -1 0 0 0 0]", "(0 0 0)", velocity),
+        alpha: ("[0 0 0 0 0 0 0]", "0", fraction),
+        "p_rgh": ("[1 -1 -2 0 0 0 0]", "0", pressure),
+    }
 
 
 def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
@@ -228,7 +264,9 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
     flow = jet.inflow(cfg, mesh)
     end_s = round(float(flow.times_s[-1]) + cfg.grid.settle_s, 9)
     _write_mesh(mesh, folder / "constant" / "polyMesh")
-    _write_inflow(flow, mesh, folder / "constant" / "boundaryData" / "substrate")
+    inlet = cfg.grid.inlet
+    data = folder / "constant" / "boundaryData" / inlet
+    _write_inflow(flow, mesh.faces_of(inlet)[0], data, fractions=inlet == "top")
     skewed = bool(np.ptp(mesh.substrate.smooth(mesh.points[:, 0], mesh.points[:, 1])) > 0)
     gravity: dict[str, Entry] = {
         "dimensions": "[0 1 -2 0 0 0 0]",
@@ -246,23 +284,7 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(header(cls, file.name) + dictionary(entries))
-    inlet: Entry = {
-        "type": "timeVaryingMappedFixedValue",
-        "mapMethod": "nearest",
-        "setAverage": "off",
-        "value": "uniform (0 0 0)",
-    }
-    free: Entry = {"type": "pressureInletOutletVelocity", "value": "uniform (0 0 0)"}
-    air: Entry = {"type": "totalPressure", "p0": "uniform 0", "value": "uniform 0"}
-    # Full of sealant as far as the wall is concerned: what comes out of it is, and what lies on it sticks to it.
-    full: Entry = {"type": "fixedValue", "value": "uniform 1"}
-    fields: dict[str, tuple[str, str, Entry, Entry]] = {
-        "U": ("[0 1 -1 0 0 0 0]", "(0 0 0)", free, inlet),
-        f"alpha.{FLUID}": ("[0 0 0 0 0 0 0]", "0", _OPEN, full),
-        "p_rgh": ("[1 -1 -2 0 0 0 0]", "0", air, {"type": "fixedFluxPressure", "value": "uniform 0"}),
-    }
     (folder / "0").mkdir()
-    for name, (dimensions, value, outside, wall) in fields.items():
-        text = _field(name, dimensions, value, {"top": outside, "sides": outside, "substrate": wall})
-        (folder / "0" / name).write_text(text)
+    for name, (dimensions, value, patches) in _boundaries(inlet).items():
+        (folder / "0" / name).write_text(_field(name, dimensions, value, patches))
     return mesh, flow, end_s

@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from seal_gym.core.errors import ConfigError, SealGymError, is_number, require
 from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown.substrates import SUBSTRATES
+from seal_gym.sealant.pneumatics import SEALANTS, Sealant
 
 GRAVITY_MPS2 = 9.81
 STANDARD_GRAVITY = (0.0, 0.0, -GRAVITY_MPS2)
 SOLVERS = ("interFoam", "interIsoFoam")
-THESIS_FLOW_M3S = 15e-3 / 1200.0  # paper B 3.2.2: 15 g/s; its density is not given
+# paper B 3.2.2: 15 g/s; its density is not given
+THESIS_FLOW_M3S = 15e-3 / SEALANTS["neutral_silicone"].density_kg_m3
 
 
 class LaydownError(SealGymError, RuntimeError):
@@ -28,30 +30,23 @@ def _in_range(name: str, value: object, low: float, high: float, unit: str) -> N
 
 @dataclass(frozen=True, kw_only=True)
 class FluidCfg:
-    """A Herschel-Bulkley fluid, ``tau = tau_y + K shear_rate^n``; defaults lie within silicone's priors.
+    """The sealant as the solver takes it.
 
     Attributes:
-        density_kgpm3: [kg/m3].
-        yield_stress_pa: tau_y [Pa].
-        consistency_pasn: K [Pa s^n].
-        flow_index: n [1].
+        sealant: The material.
         surface_tension_npm: Against air [N/m].
         viscosity_cap_pas: Viscosity of the unyielded fluid [Pa s]; the solver knows no rigid body. Below
-            the shear rate tau_y / cap the yield stress is not held.
+            the shear rate yield stress / cap the yield stress is not held.
     """
 
-    density_kgpm3: float = 1200.0
-    yield_stress_pa: float = 200.0
-    consistency_pasn: float = 100.0
-    flow_index: float = 0.4
+    sealant: Sealant = SEALANTS["neutral_silicone"]
     surface_tension_npm: float = 0.03
     viscosity_cap_pas: float = 1000.0
 
     def __post_init__(self) -> None:
-        _in_range("density_kgpm3", self.density_kgpm3, 500.0, 3000.0, "kg/m3")
-        _in_range("yield_stress_pa", self.yield_stress_pa, 0.0, 5000.0, "Pa")
-        _in_range("consistency_pasn", self.consistency_pasn, 1e-3, 5000.0, "Pa s^n")
-        _in_range("flow_index", self.flow_index, 0.1, 1.0, "")
+        require(
+            isinstance(self.sealant, Sealant), f"sealant = {self.sealant!r}: must be a Sealant, see SEALANTS"
+        )
         _in_range("surface_tension_npm", self.surface_tension_npm, 0.0, 0.2, "N/m")
         _in_range("viscosity_cap_pas", self.viscosity_cap_pas, 1.0, 1e5, "Pa s")
 
@@ -67,7 +62,7 @@ class NozzleCfg:
         radius_m: Of the round jet [m].
         jet_speed_mps: Of the fluid relative to the tip [m/s]. A sheet's thickness at the distance r follows
             from it: flow / (fan_angle_rad r jet_speed_mps).
-        strip_m: Thickness of the strip over which a sheet's fluid is given to the substrate [m].
+        strip_m: Thickness of the strip over which a sheet's fluid comes in [m].
     """
 
     kind: Literal["fan", "round"] = "fan"
@@ -91,6 +86,8 @@ class GridCfg:
     Attributes:
         cell_m: Edge of a cell [m].
         clearance_m: Height of the mesh above the highest part of the substrate [m].
+        inlet: Where the jet comes in: ``"substrate"``: through the faces that it lands on, without momentum;
+            ``"top"``: through the mesh's top, in strips that it fills, slowed down as their thickness asks.
         margin_m: Mesh around the area that the jet meets [m].
         solver: ``"interFoam"`` (interface compression) or ``"interIsoFoam"`` (geometric interface).
         courant: Largest Courant number.
@@ -100,7 +97,8 @@ class GridCfg:
 
     cell_m: float = 1e-3
     clearance_m: float = 6e-3
-    margin_m: float = 5e-3
+    inlet: Literal["substrate", "top"] = "substrate"
+    margin_m: float = 6e-3
     solver: Literal["interFoam", "interIsoFoam"] = "interFoam"
     courant: float = 0.5
     inlet_dt_s: float = 1e-3
@@ -110,6 +108,7 @@ class GridCfg:
         _in_range("cell_m", self.cell_m, 1e-4, 5e-3, "m")
         _in_range("clearance_m", self.clearance_m, 2e-3, 5e-2, "m")
         _in_range("margin_m", self.margin_m, 1e-3, 5e-2, "m")
+        require(self.inlet in ("substrate", "top"), f"inlet = {self.inlet!r}: must be 'substrate' or 'top'")
         require(self.solver in SOLVERS, f"solver = {self.solver!r}: must be one of {', '.join(SOLVERS)}")
         _in_range("courant", self.courant, 0.05, 2.0, "")
         _in_range("inlet_dt_s", self.inlet_dt_s, 1e-5, 1e-2, "s")
@@ -174,9 +173,8 @@ class TcpPath:
             Shape (m, 3) [m/s].
         """
         legs = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
-        return np.asarray(
-            legs[np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(legs) - 1)]
-        )
+        leg = np.searchsorted(self.times_s, times_s, "right") - 1
+        return np.asarray(legs[np.clip(leg, 0, len(legs) - 1)])
 
     def volume_m3(self) -> float:
         """What the nozzle gives along the whole path.
@@ -213,5 +211,5 @@ class LaydownCfg:
             f"substrate = {self.substrate!r}: must be one of {', '.join(SUBSTRATES)}",
             ConfigError,
         )
-        ok = len(self.gravity_mps2) == 3 and all(is_number(g) for g in self.gravity_mps2)
+        ok = np.shape(self.gravity_mps2) == (3,) and all(map(is_number, self.gravity_mps2))
         require(ok, f"gravity_mps2 = {self.gravity_mps2!r}: must be three numbers")

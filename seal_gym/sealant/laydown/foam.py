@@ -88,9 +88,8 @@ def values(array: Array) -> str:
     if array.ndim == 1:
         body = "\n".join("0" if v == 0 else f"{v:.10g}" for v in array.tolist())
     else:
-        body = "\n".join(
-            "(0 0 0)" if not any(v) else "({:.10g} {:.10g} {:.10g})".format(*v) for v in array.tolist()
-        )
+        rows = array.tolist()
+        body = "\n".join("({:.10g} {:.10g} {:.10g})".format(*v) if any(v) else "(0 0 0)" for v in rows)
     return f"{len(array)}\n(\n{body}\n)\n"
 
 
@@ -113,11 +112,7 @@ def read_field(path: Path, cells: int) -> Array:
     uniform = _UNIFORM.search(text)
     if uniform:
         numbers = np.array(uniform[1].strip(" ()").split(), dtype=float)
-        return np.asarray(
-            np.repeat(numbers[None], cells, 0).squeeze(-1)
-            if len(numbers) == 1
-            else np.tile(numbers, (cells, 1))
-        )
+        return np.full(cells, numbers[0]) if len(numbers) == 1 else np.tile(numbers, (cells, 1))
     found = _LIST.search(text)
     width = {name: n for n, name in _FIELD_TYPES.items()}[found[1]] if found else 0
     end = text.find("\n)", found.end()) if found else -1

@@ -1,8 +1,14 @@
-"""The free jet between nozzle and substrate: parcels that fly ballistically, and what they bring to each face.
+"""The free jet from nozzle to substrate: parcels that fly ballistically, and what they bring to each face.
 
 The tip may move, turn and change its flow in any way. Each parcel keeps the volume it was given, so that the
 inflow's integral over time is the nozzle's to rounding; a jet that the tip stretches or compresses on its way
 arrives stretched or compressed.
+
+A fan's sheet is some 0.2 mm thick where it lands, far thinner than an affordable cell: let in through the top
+of the mesh it has to be made thicker and slower, and then hangs together, tears or drags air along. The real
+one loses its momentum within about its own thickness (Reynolds number of the impact about 2). By default its
+fluid is therefore given to the substrate's faces where it comes down, without momentum, and pushes up what is
+there.
 """
 
 import math
@@ -128,40 +134,44 @@ def _reach_s(cfg: LaydownCfg) -> float:
     return 3.0 * height / cfg.nozzle.jet_speed_mps
 
 
-def landings(cfg: LaydownCfg) -> tuple[Parcels, Array, Array]:
-    """Where the jet comes down on the bare substrate.
+def landings(cfg: LaydownCfg, surface: Height | None = None) -> tuple[Parcels, Array, Array, Array]:
+    """Where the jet comes down.
 
     Args:
         cfg: The simulation.
+        surface: z [m] of (x, y) [m]; the bare substrate by default.
 
     Returns:
-        The parcels, their times of arrival (n,) [s] and places (n, 3) [m].
+        The parcels, their times of arrival (n,) [s], places (n, 3) [m] and velocities there (n, 3) [m/s].
 
     Raises:
-        LaydownError: If a part of the jet misses the substrate.
+        LaydownError: If a part of the jet misses the surface.
     """
-    jet, surface = emit(cfg), SUBSTRATES[cfg.substrate].height
-    t, place, _ = fly(
-        jet.positions, jet.velocities, np.asarray(cfg.gravity_mps2), surface, reach_s=_reach_s(cfg)
-    )
+    jet, surface = emit(cfg), surface or SUBSTRATES[cfg.substrate].height
+    gravity = np.asarray(cfg.gravity_mps2)
+    t, place, velocity = fly(jet.positions, jet.velocities, gravity, surface, reach_s=_reach_s(cfg))
     if np.isnan(t).any():
+        part = f"{np.isnan(t).mean():.1%} of the jet"
         raise LaydownError(
-            f"{np.isnan(t).mean():.1%} of the jet does not come down on the substrate: tilt or drag less"
+            f"{part} does not come down on the substrate: tilt or drag less"
+            + (", or keep the tip above the mesh (grid.clearance_m)" if cfg.grid.inlet == "top" else "")
         )
-    return jet, jet.times_s + t, place
+    return jet, jet.times_s + t, place, velocity
 
 
 @dataclass(frozen=True)
 class Inflow:
-    """What comes in through the substrate's faces, linear between samples.
+    """What comes in through the faces of a patch, linear between samples.
 
     Attributes:
         times_s: Shape (s,), evenly spaced from 0; nothing flows at the first and the last.
         flows_m3s: Through each face at each sample, shape (s, f).
+        velocities: On each face, as fast as the flow asks of a face that it fills, shape (s, f, 3) [m/s].
     """
 
     times_s: Array
     flows_m3s: Array
+    velocities: Array
 
     def volume_m3(self) -> float:
         """The volume that comes in.
@@ -173,27 +183,37 @@ class Inflow:
 
 
 def inflow(cfg: LaydownCfg, mesh: Mesh) -> Inflow:
-    """The jet on the substrate's faces.
+    """The jet on the faces where it comes in.
 
     Args:
         cfg: The simulation.
         mesh: Its mesh.
 
     Returns:
-        Samples from 0 to after the last parcel; their volume is the path's to rounding.
+        Samples from 0 to after the last parcel; their volume is the path's to rounding. Through the substrate
+        they run along its normal, through the top along the jet.
 
     Raises:
-        LaydownError: If a part of the jet misses the substrate.
+        LaydownError: If a part of the jet misses the substrate or the mesh's top.
     """
-    jet, arrival, place = landings(cfg)
-    dt, faces = cfg.grid.inlet_dt_s, cKDTree(mesh.faces_of("substrate")[0])
+    top = cfg.grid.inlet == "top"
+    jet, arrival, place, velocity = landings(cfg, mesh.top if top else None)
+    centres, areas = mesh.faces_of(cfg.grid.inlet)
+    dt, faces = cfg.grid.inlet_dt_s, cKDTree(centres)
     index, part = np.divmod(arrival / dt + 1.0, 1.0)
-    samples = int(index.max()) + 3
-    size = samples * faces.n
-    flows = np.zeros(size)
+    shape = int(index.max()) + 3, faces.n
+    size = shape[0] * shape[1]
+    flows, momentum = np.zeros(size), np.zeros((3, size))
     for layer in (np.arange(_LAYERS) + 0.5) / _LAYERS - 0.5:
         _, face = faces.query(place + layer * cfg.nozzle.strip_m * jet.across)
         for sample, weight in ((index, 1.0 - part), (index + 1, part)):
+            at = sample.astype(int) * faces.n + face
             amount = jet.volumes_m3 / _LAYERS * weight / dt
-            flows += np.bincount(sample.astype(int) * faces.n + face, weights=amount, minlength=size)
-    return Inflow(np.arange(samples) * dt, flows.reshape(samples, faces.n))
+            flows += np.bincount(at, weights=amount, minlength=size)
+            if top:
+                momentum += [np.bincount(at, weights=amount * v, minlength=size) for v in velocity.T]
+    flow = flows.reshape(shape)
+    along = momentum.T.reshape(*shape, 3) if top else np.broadcast_to(-areas, (*shape, 3))
+    inward = -(along * areas).sum(-1)
+    speed = np.divide(flow, inward, out=np.zeros(shape), where=flow > 0)  # so that velocity . area = -flow
+    return Inflow(np.arange(shape[0], dtype=float) * dt, flow, along * speed[:, :, None])

@@ -1,4 +1,4 @@
-"""A mesh of hexahedra over a substrate: columns of whole cells above the carved part, shifted with the smooth part."""
+"""A mesh of boxes over a substrate: columns of cells above the carved part, moved by the smooth part."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -54,6 +54,19 @@ class Mesh:
         area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         return corners.mean(1), area
 
+    def top(self, x: Array, y: Array) -> Array:
+        """The mesh's top.
+
+        Args:
+            x: Shape (...) [m].
+            y: Shape (...) [m].
+
+        Returns:
+            z, shape (...) [m].
+        """
+        flat = self.origin[2] + self.cell_ids.shape[2] * self.cell_m
+        return np.asarray(flat + self.substrate.smooth(x, y))
+
     def cells_at(self, points: Array) -> Indices:
         """Which cells hold some points.
 
@@ -70,6 +83,48 @@ class Mesh:
         inside = ((index >= 0) & (index < shape)).all(-1)
         i, j, k = np.moveaxis(np.clip(index, 0, shape - 1), -1, 0)
         return np.where(inside, self.cell_ids[i, j, k], -1)
+
+
+def _all_faces(cell_ids: Indices) -> tuple[Indices, Indices, Indices, Indices]:
+    """Every face of the box's lattice.
+
+    Args:
+        cell_ids: See ``Mesh``.
+
+    Returns:
+        Corner points (f, 4) as numbers in the lattice, anticlockwise seen from the far side; the cells before
+        and behind (f,), -1 for none; the patch that a face is on if it is on one (f,).
+    """
+    lattice = [n + 1 for n in cell_ids.shape]
+    quads, lows, highs, kinds = [], [], [], []
+    point = np.arange(np.prod(lattice)).reshape(lattice)
+    for axis in range(3):
+        pad = [(0, 0)] * 3
+        pad[axis] = (1, 1)
+        padded = np.pad(cell_ids, pad, constant_values=-1)
+        below = np.delete(padded, -1, axis)
+        above = np.delete(padded, 0, axis)
+        b, c = [(a + axis) % 3 for a in (1, 2)]
+        corner = []
+        for db, dc in ((0, 0), (1, 0), (1, 1), (0, 1)):  # seen from the far side: anticlockwise
+            cut: list[slice] = [slice(None)] * 3
+            cut[b] = slice(db, point.shape[b] - 1 + db)
+            cut[c] = slice(dc, point.shape[c] - 1 + dc)
+            corner.append(point[tuple(cut)])
+        wall = np.full(below.shape, 2)  # substrate ...
+        ends: list[slice] = [slice(None)] * 3
+        for end in (0, -1):  # ... except at the ends of the box
+            ends[axis] = slice(end, None) if end else slice(0, 1)
+            if axis < 2:
+                wall[tuple(ends)] = 1
+            elif end:
+                wall[tuple(ends)] = 0
+        quads.append(np.stack(corner, -1).reshape(-1, 4))
+        lows.append(below.reshape(-1))
+        highs.append(above.reshape(-1))
+        kinds.append(wall.reshape(-1))
+    quad, low, high, kind = (np.concatenate(parts) for parts in (quads, lows, highs, kinds))
+    return quad, low, high, kind
 
 
 def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cell_m: float) -> Mesh:
@@ -103,34 +158,7 @@ def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cel
 
     gx, gy, gz = np.meshgrid(x, y, origin[2] + np.arange(nz + 1) * cell_m, indexing="ij")
     points = np.stack((gx, gy, gz + substrate.smooth(gx, gy)), -1).reshape(-1, 3)
-    quads, lows, highs, kinds = [], [], [], []
-    point = np.arange(len(points)).reshape(nx + 1, ny + 1, nz + 1)
-    for axis in range(3):
-        pad = [(0, 0)] * 3
-        pad[axis] = (1, 1)
-        padded = np.pad(cell_ids, pad, constant_values=-1)
-        below = np.delete(padded, -1, axis)
-        above = np.delete(padded, 0, axis)
-        b, c = [(a + axis) % 3 for a in (1, 2)]
-        corner = []
-        for db, dc in ((0, 0), (1, 0), (1, 1), (0, 1)):  # seen from the far side: anticlockwise
-            cut: list[slice] = [slice(None)] * 3
-            cut[b] = slice(db, point.shape[b] - 1 + db)
-            cut[c] = slice(dc, point.shape[c] - 1 + dc)
-            corner.append(point[tuple(cut)])
-        wall = np.full(below.shape, 2)  # substrate ...
-        ends: list[slice] = [slice(None)] * 3
-        for end in (0, -1):  # ... except at the ends of the box
-            ends[axis] = slice(end, None) if end else slice(0, 1)
-            if axis < 2:
-                wall[tuple(ends)] = 1
-            elif end:
-                wall[tuple(ends)] = 0
-        quads.append(np.stack(corner, -1).reshape(-1, 4))
-        lows.append(below.reshape(-1))
-        highs.append(above.reshape(-1))
-        kinds.append(wall.reshape(-1))
-    quad, a, b_, kind = (np.concatenate(parts) for parts in (quads, lows, highs, kinds))
+    quad, a, b_, kind = _all_faces(cell_ids)
     inner = (a >= 0) & (b_ >= 0)
     order = np.flatnonzero(inner)[np.lexsort((b_[inner], a[inner]))]
     faces, owner, neighbour = [quad[order]], [a[order]], b_[order]

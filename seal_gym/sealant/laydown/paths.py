@@ -19,7 +19,7 @@ _HALF = math.sqrt(0.5) * GRAVITY_MPS2
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What a tip path's parameters are drawn from: uniform in the bounds at its start, then normal around that.
+    """What a tip path's parameters are drawn from: uniform at its start, then normal around that.
 
     Attributes:
         offset_m: Tip to centre path: low, high, standard deviation [m].
@@ -50,7 +50,7 @@ class Bounds:
         ).T
         first = rng.uniform(low, high)
         later = rng.normal(first, deviation, (knots - 1, len(first)))
-        return np.clip(np.vstack((first, later)), low, high)
+        return np.asarray(np.clip(np.vstack((first, later)), low, high))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class CentrePath:
 
     name: str
     substrate: str
-    legs: tuple[tuple[float, float], ...] = ((50e-3, 0.0),)
+    legs: tuple[tuple[float, float], ...] = ((60e-3, 0.0),)
     heading_rad: float = 0.0
     shift_m: tuple[float, float] = (0.0, 0.0)
     gravity_mps2: tuple[float, float, float] = STANDARD_GRAVITY
@@ -163,17 +163,17 @@ def _arc(length_m: float, radius_m: float) -> tuple[tuple[float, float], ...]:
 
 def _make() -> tuple[tuple[CentrePath, ...], tuple[CentrePath, ...]]:
     make: Callable[..., CentrePath] = CentrePath
-    s_curve = ((25e-3, 1 / 30e-3), (25e-3, -1 / 30e-3))
-    zigzag = tuple((12.5e-3, sign / 12e-3) for sign in (1, -1, 1, -1))
-    corner_leg = ((19e-3, 0.0), (8e-3 * math.pi / 2, 1 / 8e-3), (19e-3, 0.0))
-    hairpin = ((5e-3, 0.0), (13e-3 * math.pi, -1 / 13e-3), (5e-3, 0.0))
+    s_curve = ((30e-3, 1 / 30e-3), (30e-3, -1 / 30e-3))
+    zigzag = tuple((15e-3, sign / 12e-3) for sign in (1, -1, 1, -1))
+    corner_leg = ((24e-3, 0.0), (8e-3 * math.pi / 2, 1 / 8e-3), (24e-3, 0.0))
+    hairpin = ((10e-3, 0.0), (15e-3 * math.pi, -1 / 15e-3), (10e-3, 0.0))
     narrow = math.radians(15.0)
     diagonal = math.pi / 4
     training = (
         make(name="plane_straight", substrate="plane"),
-        make(name="plane_left", substrate="plane", legs=_arc(50e-3, 40e-3)),
-        make(name="plane_right", substrate="plane", legs=_arc(50e-3, -40e-3)),
-        make(name="plane_wide", substrate="plane", legs=_arc(50e-3, 100e-3)),
+        make(name="plane_left", substrate="plane", legs=_arc(60e-3, 40e-3)),
+        make(name="plane_right", substrate="plane", legs=_arc(60e-3, -40e-3)),
+        make(name="plane_wide", substrate="plane", legs=_arc(60e-3, 100e-3)),
         make(name="plane_s", substrate="plane", legs=s_curve),
         make(name="plane_corner", substrate="plane", legs=corner_leg),
         make(name="plane_zigzag", substrate="plane", legs=zigzag),
@@ -207,14 +207,14 @@ def _make() -> tuple[tuple[CentrePath, ...], tuple[CentrePath, ...]]:
         make(name="ridge_oblique", substrate="ridge", heading_rad=diagonal, surface_normal=True),
     )
     validation = (
-        make(name="stairs_edge", substrate="stairs", shift_m=(3.5e-3, 0.0)),
-        make(name="stairs_tread", substrate="stairs", legs=_arc(50e-3, 120e-3)),
+        make(name="stairs_edge", substrate="stairs", shift_m=(4e-3, 0.0)),
+        make(name="stairs_tread", substrate="stairs", legs=_arc(60e-3, 120e-3)),
         make(name="ramp_foot", substrate="ramp"),
         make(name="ramp_oblique", substrate="ramp", heading_rad=-diagonal),
         make(name="vee_along", substrate="vee"),
         make(name="vee_oblique", substrate="vee", heading_rad=diagonal),
         make(name="wave_along", substrate="wave", surface_normal=True),
-        make(name="wave_oblique", substrate="wave", heading_rad=diagonal, legs=_arc(50e-3, 80e-3)),
+        make(name="wave_oblique", substrate="wave", heading_rad=diagonal, legs=_arc(60e-3, 80e-3)),
         make(name="dome_across", substrate="dome", shift_m=(4e-3, 0.0), surface_normal=True),
         make(name="box_side", substrate="box"),
         make(name="pocket_along", substrate="pocket"),

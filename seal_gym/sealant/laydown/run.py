@@ -1,7 +1,7 @@
 """Runs a laydown simulation and checks what came of it."""
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from seal_gym.sealant.laydown.config import LaydownCfg
 from seal_gym.sealant.laydown.mesh import Mesh
 
 _PILE_M = 3e-3
+_ROOM_M, _ROOM_PEAKS, _MOST_ROOM_M = 3e-3, 1.6, 5e-2
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Laydown:
         fractions: Volume fraction of sealant by cell, shape (cells,).
         commanded_m3: What the nozzle gave.
         volume_m3: What lies in the mesh.
-        lid_fraction: Largest volume fraction in the mesh's highest layer; the bead is cut off there if it is 1.
+        lid_fraction: Largest volume fraction in the mesh's highest layer; at 1 the bead is cut off there.
         cpu_s: Processor time of the solver.
     """
 
@@ -50,13 +51,26 @@ def expected_peak_m(cfg: LaydownCfg) -> float:
     Returns:
         The largest mean height over 3 x 3 mm [m].
     """
-    jets, _, place = jet.landings(cfg)
+    jets, _, place, _ = jet.landings(cfg)
     cell = 1e-3
     low = np.floor(place[:, :2].min(0) / cell) - 3
     i, j = (np.floor(place[:, :2] / cell) - low).astype(int).T
     pile = np.zeros((i.max() + 4, j.max() + 4))
     np.add.at(pile, (i, j), jets.volumes_m3 / cell**2)
     return float(ndimage.uniform_filter(pile, round(_PILE_M / cell)).max())
+
+
+def with_room(cfg: LaydownCfg) -> LaydownCfg:
+    """Makes a simulation's mesh high enough for its bead.
+
+    Args:
+        cfg: The simulation.
+
+    Returns:
+        The same with a clearance of at least 1.6 times the expected peak and 3 mm, at most 5 cm.
+    """
+    room = min(_ROOM_M + _ROOM_PEAKS * expected_peak_m(cfg), _MOST_ROOM_M)
+    return replace(cfg, grid=replace(cfg.grid, clearance_m=max(cfg.grid.clearance_m, room)))
 
 
 def simulate(cfg: LaydownCfg, folder: Path, *, limit_s: float = 3600.0, keep: bool = False) -> Laydown:

@@ -31,11 +31,11 @@ class Stations:
         linear_mps: The tip's velocity to the next station, in its frame, shape (n, 3).
         angular_radps: The tip's angular velocity to the next station, in its frame, shape (n, 3).
         gravity_mps2: In the tip's frame, shape (n, 3).
-        heights_m: Along -z from points 1 mm apart on the tip's x axis, left to right, to the substrate; at most
-            ``RAY_LIMIT_M``: shape (n, 41).
+        heights_m: Along -z from points 1 mm apart on the tip's x axis, left to right, to the substrate; at
+            most ``RAY_LIMIT_M``: shape (n, 41).
         hits: Where the nozzle points at, shape (n, 3) [m].
         tips: ``R_substrate_tip``, shape (n, 3, 3).
-        across: Frames with y along the hits' travel seen from above and z along the substrate's, shape (n, 3, 3).
+        across: Frames with y along the hits' travel from above, z the substrate's, shape (n, 3, 3).
         ideal_m2: Flow / speed of the hits seen from above: the area of a cut across travel, shape (n,).
     """
 
@@ -161,17 +161,17 @@ def width_m(images: Array) -> Array:
         Shape (...) [m]; 0 without a bead.
     """
     thick = np.pad(images.sum(-2) * PIXEL_M, [(0, 0)] * (images.ndim - 2) + [(1, 1)])
-    bead = thick >= _BEAD_M
 
-    def edge(thick: Array, bead: Array) -> Array:
+    def edge(thick: Array) -> Array:
+        bead = thick >= _BEAD_M
         first = bead.argmax(-1)[..., None]
         inner = np.take_along_axis(thick, first, -1)
         outer = np.take_along_axis(thick, np.maximum(first - 1, 0), -1)
         part = np.divide(inner - _BEAD_M, inner - outer, out=np.zeros_like(inner), where=inner > outer)
         return np.asarray((first - part)[..., 0])
 
-    left, right = edge(thick, bead), edge(thick[..., ::-1], bead[..., ::-1])
-    return np.where(bead.any(-1), (thick.shape[-1] - 1 - left - right) * PIXEL_M, 0.0)
+    left, right = edge(thick), edge(thick[..., ::-1])
+    return np.where((thick >= _BEAD_M).any(-1), (thick.shape[-1] - 1 - left - right) * PIXEL_M, 0.0)
 
 
 def iou(a: Array, b: Array) -> Array:

@@ -83,7 +83,7 @@ def _dome(x: Array, y: Array) -> Array:
 
 
 def _stairs(x: Array, y: Array) -> Array:
-    return np.asarray(2e-3 * np.clip(np.floor(x / 7e-3 + 0.5), -1.0, 1.0) + 0.0 * y)
+    return np.asarray(2e-3 * np.clip(np.floor(x / 8e-3 + 0.5), -1.0, 1.0) + 0.0 * y)
 
 
 def _box(x: Array, y: Array) -> Array:
