@@ -35,6 +35,25 @@ def test_a_bead_has_the_volume_that_was_given_and_lies_under_its_path(tmp_path, 
     assert (columns * np.arange(-19.5, 20)).sum() / columns.sum() == pytest.approx(0.0, abs=0.3)
 
 
+def test_a_bead_below_its_yield_stress_stays_as_it_lies(tmp_path):
+    # 1200 kg/m3 x 9.81 m/s2 x 2 mm = 24 Pa, far below the yield stress: waiting must change nothing.
+    widths = []
+    for settle_s in (0.01, 0.15):
+        cfg = straight(length_m=0.02, grid=GridCfg(cell_m=1e-3, settle_s=settle_s))
+        bead = simulate(cfg, tmp_path / "case", limit_s=600.0)
+        assert abs(bead.volume_error) < 1e-4
+        at = sections.stations(cfg)
+        images = sections.cut(bead.mesh, bead.fractions, at.hits, at.tips)[8:12]
+        widths.append(sections.width_m(images).mean())
+    assert widths[1] == pytest.approx(widths[0], abs=0.05e-3)
+
+
+def test_the_same_simulation_gives_the_same_bead(tmp_path):
+    cfg = straight(length_m=0.02, grid=GridCfg(cell_m=2e-3))
+    one, two = (simulate(cfg, tmp_path / "case", limit_s=300.0).fractions for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+
+
 @pytest.mark.parametrize("substrate", ["trench", "inner_corner", "wave"])
 def test_openfoam_finds_no_fault_with_a_mesh(tmp_path, substrate):
     cfg = straight(substrate=substrate, grid=GridCfg(cell_m=1e-3))
