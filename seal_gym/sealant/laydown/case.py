@@ -129,9 +129,9 @@ def schemes(grid: GridCfg) -> dict[str, Entry]:
 def solution(grid: GridCfg, *, skewed: bool) -> dict[str, Entry]:
     """``fvSolution``.
 
-    No momentum predictor: the viscous term is some hundred times stiffer than the step, and what two pressure
-    corrections leave of the predictor's velocity keeps a bead at rest stirring at 0.1 m/s and creeping outwards,
-    the more the longer it is left. With six corrections, or without predictor, it comes to rest.
+    No momentum predictor: the viscous term is some hundred times stiffer than the step. What two pressure
+    corrections leave of a predictor's velocity keeps a bead at rest stirring at 0.1 m/s and lets it creep
+    outwards for as long as one waits; with six, or without a predictor, it comes to rest.
 
     Args:
         grid: Solver.
