@@ -1,0 +1,294 @@
+"""A simulation as an OpenFOAM case folder."""
+
+from pathlib import Path
+
+import numpy as np
+
+from seal_gym.core.frames import Array
+from seal_gym.sealant.laydown import foam, jet
+from seal_gym.sealant.laydown import mesh as meshes
+from seal_gym.sealant.laydown.config import FluidCfg, GridCfg, LaydownCfg
+from seal_gym.sealant.laydown.foam import Entry, dictionary, header
+from seal_gym.sealant.laydown.mesh import Mesh
+from seal_gym.sealant.laydown.substrates import SUBSTRATES
+
+FLUID = "sealant"
+_AIR_VISCOSITY_M2PS = 1.48e-5
+_AIR_DENSITY_KGPM3 = 1.2
+_OPEN: dict[str, Entry] = {"type": "inletOutlet", "inletValue": "uniform 0", "value": "uniform 0"}
+
+
+def build_mesh(cfg: LaydownCfg) -> Mesh:
+    """The mesh that a simulation needs.
+
+    Args:
+        cfg: The simulation.
+
+    Returns:
+        A mesh around all that the jet meets.
+
+    Raises:
+        LaydownError: If a part of the jet does not come down on the substrate.
+    """
+    part, grid = SUBSTRATES[cfg.substrate], cfg.grid
+    place = jet.landings(cfg)[2][:, :2]
+    if grid.inlet == "top":
+        lid = jet.landings(cfg, lambda x, y: part.height(x, y) + grid.clearance_m)[2]
+        place = np.vstack((place, lid[:, :2]))
+    return meshes.build(
+        part, place.min(0) - grid.margin_m, place.max(0) + grid.margin_m, grid.clearance_m, grid.cell_m
+    )
+
+
+def transport(fluid: FluidCfg) -> dict[str, Entry]:
+    """``transportProperties``: kinematic, as OpenFOAM has it.
+
+    Args:
+        fluid: The sealant.
+
+    Returns:
+        Entries.
+    """
+    material = fluid.sealant
+    rho = material.density_kg_m3
+    model: dict[str, Entry] = {
+        "nu0": fluid.viscosity_cap_pas / rho,
+        "tau0": material.yield_stress_pa / rho,
+        "k": material.consistency_pa_sn / rho,
+        "n": float(material.flow_index),
+    }
+    sealant: dict[str, Entry] = {
+        "transportModel": "HerschelBulkley",
+        "HerschelBulkleyCoeffs": model,
+        "rho": float(rho),
+    }
+    air: dict[str, Entry] = {
+        "transportModel": "Newtonian",
+        "nu": _AIR_VISCOSITY_M2PS,
+        "rho": _AIR_DENSITY_KGPM3,
+    }
+    return {"phases": f"({FLUID} air)", FLUID: sealant, "air": air, "sigma": float(fluid.surface_tension_npm)}
+
+
+def control(grid: GridCfg, end_s: float) -> dict[str, Entry]:
+    """``controlDict``.
+
+    Args:
+        grid: Solver and time step.
+        end_s: Simulated time [s].
+
+    Returns:
+        Entries.
+    """
+    return {
+        "application": grid.solver,
+        "startFrom": "startTime",
+        "startTime": 0,
+        "stopAt": "endTime",
+        "endTime": end_s,
+        "deltaT": 1e-5,
+        "writeControl": "adjustableRunTime",
+        "writeInterval": end_s,
+        "writeFormat": "ascii",
+        "writePrecision": 9,
+        "timePrecision": 9,
+        "adjustTimeStep": "yes",
+        "maxCo": float(grid.courant),
+        "maxAlphaCo": float(grid.courant),
+        "maxDeltaT": 0.5 * grid.inlet_dt_s,
+        "runTimeModifiable": "no",
+    }
+
+
+def schemes(grid: GridCfg) -> dict[str, Entry]:
+    """``fvSchemes``.
+
+    Args:
+        grid: Solver.
+
+    Returns:
+        Entries.
+    """
+    limited = "limited 0.5"
+    return {
+        "ddtSchemes": {"default": "Euler"},
+        "gradSchemes": {"default": "Gauss linear"},
+        "divSchemes": {
+            "div(rhoPhi,U)": "Gauss linearUpwind grad(U)",
+            "div(phi,alpha)": "Gauss vanLeer",
+            "div(phirb,alpha)": "Gauss linear",
+            "div(((rho*nuEff)*dev2(T(grad(U)))))": "Gauss linear",
+        },
+        "laplacianSchemes": {"default": f"Gauss linear {limited}"},
+        "interpolationSchemes": {"default": "linear"},
+        "snGradSchemes": {"default": limited},
+        "fluxRequired": {"default": "no", "p_rgh": "", "pcorr": "", f"alpha.{FLUID}": ""},
+    }
+
+
+def solution(grid: GridCfg, *, skewed: bool) -> dict[str, Entry]:
+    """``fvSolution``.
+
+    No momentum predictor: the viscous term is some hundred times stiffer than the step. What two pressure
+    corrections leave of a predictor's velocity keeps a bead at rest stirring at 0.1 m/s and lets it creep
+    outwards for as long as one waits; with six, or without a predictor, it comes to rest.
+
+    Args:
+        grid: Solver.
+        skewed: Whether the mesh follows a smooth substrate.
+
+    Returns:
+        Entries.
+    """
+    alpha: dict[str, Entry] = {
+        "nAlphaCorr": 1,
+        "nAlphaSubCycles": 1,
+        "cAlpha": 1,
+        "MULESCorr": "yes",
+        "nLimiterIter": 5,
+        "solver": "smoothSolver",
+        "smoother": "symGaussSeidel",
+        "tolerance": 1e-10,
+        "relTol": 0,
+        # of interIsoFoam
+        "isoFaceTol": 1e-6,
+        "surfCellTol": 1e-6,
+        "nAlphaBounds": 3,
+        "snapTol": 1e-12,
+        "clip": "false",
+    }
+    pressure: dict[str, Entry] = {
+        "solver": "PCG",
+        "preconditioner": "DIC",
+        "tolerance": 1e-6,
+        "relTol": 0.02,
+    }
+    return {
+        "solvers": {
+            f'"alpha.{FLUID}.*"': alpha,
+            '"pcorr.*"': pressure | {"relTol": 0, "tolerance": 1e-8},
+            "p_rgh": pressure,
+            "p_rghFinal": pressure | {"relTol": 0, "tolerance": 1e-8},
+            '"U.*"': {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-8, "relTol": 1e-3},
+        },
+        "PIMPLE": {
+            "momentumPredictor": "no",
+            "nOuterCorrectors": 1,
+            "nCorrectors": 3,
+            "nNonOrthogonalCorrectors": int(skewed),
+        },
+        "relaxationFactors": {"equations": {'".*"': 1}},
+    }
+
+
+def _field(name: str, dimensions: str, value: str, patches: dict[str, Entry]) -> str:
+    cls = "volVectorField" if name == "U" else "volScalarField"
+    entries: dict[str, Entry] = {
+        "dimensions": dimensions,
+        "internalField": f"uniform {value}",
+        "boundaryField": patches,
+    }
+    return header(cls, name) + dictionary(entries)
+
+
+def _write_mesh(mesh: Mesh, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    faces = "\n".join("4({} {} {} {})".format(*f) for f in mesh.faces.tolist())
+    (folder / "points").write_text(header("vectorField", "points") + foam.values(mesh.points))
+    (folder / "faces").write_text(header("faceList", "faces") + f"{len(mesh.faces)}\n(\n{faces}\n)\n")
+    for name, ids in (("owner", mesh.owner), ("neighbour", mesh.neighbour)):
+        body = "\n".join(map(str, ids.tolist()))
+        (folder / name).write_text(header("labelList", name) + f"{len(ids)}\n(\n{body}\n)\n")
+    kinds = {"top": "patch", "sides": "patch", "substrate": "wall"}
+    entries: dict[str, Entry] = {
+        name: {"type": kinds[name], "nFaces": count, "startFace": first}
+        for name, (first, count) in mesh.patches.items()
+    }
+    (folder / "boundary").write_text(
+        header("polyBoundaryMesh", "boundary") + f"{len(entries)}\n(\n{dictionary(entries, 1)})\n"
+    )
+
+
+def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path, *, fractions: bool) -> None:
+    folder.mkdir(parents=True)
+    (folder / "points").write_text(foam.values(centres))
+    wet = flow.flows_m3s > 0
+    wet = (
+        wet | np.roll(wet, 1, 0) | np.roll(wet, -1, 0)
+    )  # nothing flows at either end, so nothing wraps around
+    for time, velocity, full in zip(flow.times_s, flow.velocities, wet, strict=True):
+        at = folder / f"{time:.9g}"
+        at.mkdir()
+        (at / "U").write_text(foam.values(velocity))
+        if fractions:
+            (at / f"alpha.{FLUID}").write_text(foam.values(full.astype(float)))
+
+
+def _boundaries(inlet: str) -> dict[str, tuple[str, str, dict[str, Entry]]]:
+    """Dimensions, initial value and boundary conditions of each field."""
+    free: Entry = {"type": "pressureInletOutletVelocity", "value": "uniform (0 0 0)"}
+    air: Entry = {"type": "totalPressure", "p0": "uniform 0", "value": "uniform 0"}
+    given: Entry = {"type": "fixedFluxPressure", "value": "uniform 0"}
+    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": "off"}
+    jets: Entry = mapped | {"value": "uniform (0 0 0)"}
+    alpha = f"alpha.{FLUID}"
+    velocity: dict[str, Entry] = {"top": free, "sides": free, "substrate": jets}
+    # To the fluid the wall is full of sealant: what comes out of it is, and what lies on it sticks to it.
+    fraction: dict[str, Entry] = {
+        "top": _OPEN,
+        "sides": _OPEN,
+        "substrate": {"type": "fixedValue", "value": "uniform 1"},
+    }
+    pressure: dict[str, Entry] = {"top": air, "sides": air, "substrate": given}
+    if inlet == "top":
+        velocity |= {"top": jets, "substrate": {"type": "noSlip"}}
+        fraction |= {"top": mapped | {"value": "uniform 0"}, "substrate": {"type": "zeroGradient"}}
+        pressure |= {"top": given}
+    return {
+        "U": ("[0 1 -1 0 0 0 0]", "(0 0 0)", velocity),
+        alpha: ("[0 0 0 0 0 0 0]", "0", fraction),
+        "p_rgh": ("[1 -1 -2 0 0 0 0]", "0", pressure),
+    }
+
+
+def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
+    """Writes a case folder.
+
+    Args:
+        cfg: The simulation.
+        folder: Must not exist.
+
+    Returns:
+        The mesh, what flows in, and the simulated time [s].
+
+    Raises:
+        LaydownError: If a part of the jet does not come down on the substrate.
+    """
+    mesh = build_mesh(cfg)
+    flow = jet.inflow(cfg, mesh)
+    end_s = round(float(flow.times_s[-1]) + cfg.grid.settle_s, 9)
+    _write_mesh(mesh, folder / "constant" / "polyMesh")
+    inlet = cfg.grid.inlet
+    data = folder / "constant" / "boundaryData" / inlet
+    _write_inflow(flow, mesh.faces_of(inlet)[0], data, fractions=inlet == "top")
+    skewed = bool(np.ptp(mesh.substrate.smooth(mesh.points[:, 0], mesh.points[:, 1])) > 0)
+    gravity: dict[str, Entry] = {
+        "dimensions": "[0 1 -2 0 0 0 0]",
+        "value": "({:.9g} {:.9g} {:.9g})".format(*cfg.gravity_mps2),
+    }
+    dictionaries: dict[str, tuple[str, dict[str, Entry]]] = {
+        "constant/transportProperties": ("dictionary", transport(cfg.fluid)),
+        "constant/turbulenceProperties": ("dictionary", {"simulationType": "laminar"}),
+        "constant/g": ("uniformDimensionedVectorField", gravity),
+        "system/controlDict": ("dictionary", control(cfg.grid, end_s)),
+        "system/fvSchemes": ("dictionary", schemes(cfg.grid)),
+        "system/fvSolution": ("dictionary", solution(cfg.grid, skewed=skewed)),
+    }
+    for path, (cls, entries) in dictionaries.items():
+        file = folder / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(header(cls, file.name) + dictionary(entries))
+    (folder / "0").mkdir()
+    for name, (dimensions, value, patches) in _boundaries(inlet).items():
+        (folder / "0" / name).write_text(_field(name, dimensions, value, patches))
+    return mesh, flow, end_s
