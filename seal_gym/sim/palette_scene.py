@@ -41,7 +41,7 @@ RGB = {
 }
 _SPRING_N_M = 1000.0
 _PRELOAD_N = 3.0
-_DAMPING_N_S_M = 10.0
+_DAMPING_N_S_M = 40.0
 _HEAD_KG = 0.02
 # A limit of a joint is as stiff as the inertia behind it allows (MuJoCo's constraints act on accelerations):
 # with this one the seat gives 0.07 mm/N, as a cable does.
@@ -77,7 +77,7 @@ class Touches:
     """What touched what after each physics step of a frame.
 
     Attributes:
-        press_n: Force of the pad on each target, shape (S, n), N.
+        press_n: Force of the pad on each target along its slide, shape (S, n), N.
         slide_m: How far each target has been pressed, shape (S, n), m.
         wrong: Whether each of ``CLASSES`` and, last, anything else was touched, shape (S, 6).
         wrong_n: Force on each of ``CLASSES``, shape (S, 5), N.
@@ -102,13 +102,12 @@ def read_touches(scene: PaletteScene, contacts: Array, sensors: Array) -> Touche
     """
     n, steps = len(scene.layout.targets), len(contacts)
     pairs = sensors[:, : 4 * (n + len(CLASSES))].reshape(steps, -1, 4)
-    force = np.linalg.norm(pairs[:, :, 1:], axis=2)
+    press = np.abs(pairs[:, :n, 3])  # the palette lies level: its ties slide along the world's z
+    force = np.linalg.norm(pairs[:, n:, 1:], axis=2)
     count = pairs[:, :, 0]
     other = contacts - count.sum(axis=1)
     wrong = np.column_stack((count[:, n:], other)) > 0
-    return Touches(
-        press_n=force[:, :n], slide_m=-sensors[:, -n:], wrong=np.asarray(wrong), wrong_n=force[:, n:]
-    )
+    return Touches(press_n=press, slide_m=-sensors[:, -n:], wrong=np.asarray(wrong), wrong_n=force)
 
 
 def _quat(yaw: float) -> Array:
