@@ -37,7 +37,7 @@ class PaletteExpertCfg:
         press: Limits of the tip's motion in a press [m].
     """
 
-    clearance_m: float = 0.045
+    clearance_m: float = 0.065
     hover_m: float = 0.008
     beyond_m: float = 0.004
     brake_frames: int = 3

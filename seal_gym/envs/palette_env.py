@@ -69,12 +69,12 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ## Description
 
-    A palette carries black cables, blue connectors, green rivets and white nylon ties, laid out anew at each
-    reset; 4 to 8 of the ties stand open over red target zones, the others sit already. A tie is home when the
-    pad presses it with 15 N or more at its seat, 6 mm down against a spring; it then locks. The palette lies
-    within +-20 mm and +-15 deg of its nominal pose; the tool starts beside it. Source: Carvajal and
-    Martinez-Garcia, "Robot arm planning and control by tau-Jerk theory and vision-based recurrent ANN
-    observer", sections I, IV and V; forces, sizes and colours are this project's.
+    A palette carries black cables between grey pegs, blue connectors, green rivets and white nylon ties, laid
+    out anew at each reset; 4 to 8 of the ties stand open over red target zones, the others sit already. A
+    tie is home when the pad presses it with 15 N or more at its seat, 6 mm down against a spring; it then
+    locks. The palette lies within +-20 mm and +-15 deg of its nominal pose; the tool starts beside it.
+    Source: Carvajal and Martinez-Garcia, "Robot arm planning and control by tau-Jerk theory and vision-based
+    recurrent ANN observer", sections I, IV and V; forces, sizes and colours are this project's.
 
     The tip frame has its origin in the pad's face, z back along the tool. One step is 1/30 s. There is this
     single-environment face only; run several with ``gymnasium.vector.AsyncVectorEnv`` or ``SyncVectorEnv``.

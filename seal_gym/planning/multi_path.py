@@ -158,7 +158,7 @@ class MultiPathCfg:
     """
 
     points: int = 24
-    checked_m: float = 0.004
+    checked_m: float = 0.002
     push_m: float = 0.006
     pushes: int = 30
     spread: int = 2

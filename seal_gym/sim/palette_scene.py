@@ -17,6 +17,7 @@ from seal_gym.workpieces.palette import (
     CABLE_RADIUS_M,
     CONNECTOR_M,
     HEAD_M,
+    PEG_RADIUS_M,
     RIVET_M,
     TRAVEL_M,
     ZONE_M,
@@ -24,7 +25,7 @@ from seal_gym.workpieces.palette import (
     Spot,
 )
 
-CLASSES = ("board", "cable", "connector", "rivet", "tie")
+CLASSES = ("board", "cable", "connector", "peg", "rivet", "tie")
 """What a tool may touch by mistake; ``tie`` are the ties that sit already."""
 TOOL_PREFIX = "tool/"
 BOARD_TOP_M = TABLE_TOP_M + 0.06
@@ -35,6 +36,7 @@ RGB = {
     "board": (0.80, 0.79, 0.76),
     "cable": (0.05, 0.05, 0.05),
     "connector": (0.08, 0.16, 0.72),
+    "peg": (0.66, 0.65, 0.63),
     "rivet": (0.10, 0.55, 0.16),
     "tie": (0.93, 0.93, 0.91),
     "target": (0.78, 0.08, 0.07),
@@ -79,8 +81,8 @@ class Touches:
     Attributes:
         press_n: Force of the pad on each target along its slide, shape (S, n), N.
         slide_m: How far each target has been pressed, shape (S, n), m.
-        wrong: Whether each of ``CLASSES`` and, last, anything else was touched, shape (S, 6).
-        wrong_n: Force on each of ``CLASSES``, shape (S, 5), N.
+        wrong: Whether each of ``CLASSES`` and, last, anything else was touched, shape (S, 7).
+        wrong_n: Force on each of ``CLASSES``, shape (S, 6), N.
     """
 
     press_n: Array
@@ -153,6 +155,10 @@ def _add_fixtures(part: mujoco.MjsBody, layout: PaletteLayout) -> None:
     for spot, height in zip(layout.connectors, layout.connector_height_m, strict=True):
         place = {"pos": [spot.x, spot.y, height / 2], "quat": _quat(spot.yaw)}
         _solid(body, _G.mjGEOM_BOX, "connector", size=_box(*CONNECTOR_M, height), **place)
+    body = part.add_body(name="peg")
+    for x, y, height in layout.pegs:
+        size = [PEG_RADIUS_M, height / 2, 0]
+        _solid(body, _G.mjGEOM_CYLINDER, "peg", pos=[x, y, height / 2], size=size)
     body = part.add_body(name="rivet")
     radius, height = RIVET_M
     for x, y in layout.rivets:

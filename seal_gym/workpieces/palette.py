@@ -1,7 +1,8 @@
-"""Cable-harness palettes laid out at random: where cables, connectors, rivets and ties lie.
+"""Cable-harness palettes laid out at random: where cables, connectors, pegs, rivets and ties lie.
 
 The palette of Carvajal and Martinez-Garcia (paper T, section IV) carries black cables, connectors, rivets,
-nylon ties and target zones. Frame: origin in the middle of the board's top, x along the board, z up.
+nylon ties and target zones; ours also the pegs between which harness boards lead their cables. Frame: origin
+in the middle of the board's top, x along the board, z up.
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ CONNECTOR_M = (0.026, 0.020)
 """Length and width of a connector; its height is drawn."""
 RIVET_M = (0.004, 0.003)
 """Radius and height of a rivet."""
+PEG_RADIUS_M = 0.004
 HEAD_M = (0.012, 0.012, 0.006)
 """Length, width and height of a tie's head."""
 TRAVEL_M = 0.006
@@ -51,6 +53,8 @@ class LayoutCfg:
         branches: Number of cables that leave the trunk.
         rivets: Number of rivets.
         connector_height_m: Of each connector [m].
+        pegs: Number of pegs beside the cables.
+        peg_height_m: Of each peg [m].
         apart_m: Least distance between the middles of ties [m].
     """
 
@@ -59,6 +63,8 @@ class LayoutCfg:
     branches: tuple[int, int] = (4, 6)
     rivets: tuple[int, int] = (8, 14)
     connector_height_m: tuple[float, float] = (0.020, 0.050)
+    pegs: tuple[int, int] = (6, 12)
+    peg_height_m: tuple[float, float] = (0.040, 0.070)
     apart_m: float = 0.045
 
     def __post_init__(self) -> None:
@@ -67,12 +73,14 @@ class LayoutCfg:
         _whole_range("seated", self.seated, 0, 4)
         _whole_range("branches", self.branches, 2, 6)
         _whole_range("rivets", self.rivets, 0, 40)
-        low, high = self.connector_height_m
-        require(
-            0.005 <= low <= high <= 0.06,
-            f"LayoutCfg.connector_height_m = {self.connector_height_m!r}: must be (lowest, highest), both "
-            "within 0.005..0.06 m: the tool's pusher clears no more",
-        )
+        _whole_range("pegs", self.pegs, 0, 30)
+        for name in ("connector_height_m", "peg_height_m"):
+            low, high = getattr(self, name)
+            require(
+                0.005 <= low <= high <= 0.07,
+                f"LayoutCfg.{name} = {(low, high)!r}: must be (lowest, highest), both within 0.005..0.07 m: "
+                "the tool's pusher clears little more",
+            )
         require(
             0.02 <= self.apart_m <= 0.1, f"LayoutCfg.apart_m = {self.apart_m!r}: must be within 0.02..0.1 m"
         )
@@ -100,6 +108,7 @@ class PaletteLayout:
         cables: Centre lines, each of shape (n, 3), m.
         connectors: At the cables' ends.
         connector_height_m: Of each connector, shape (c,), m.
+        pegs: Place and height of each, shape (p, 3), m.
         rivets: Shape (r, 2), m.
         targets: Ties to press home, over their cables.
         seated: Ties that sit.
@@ -108,6 +117,7 @@ class PaletteLayout:
     cables: tuple[Array, ...]
     connectors: tuple[Spot, ...]
     connector_height_m: Array
+    pegs: Array
     rivets: Array
     targets: tuple[Spot, ...]
     seated: tuple[Spot, ...]
@@ -185,6 +195,26 @@ def _ties(
     return chosen
 
 
+def _pegs(rng: np.random.Generator, cables: list[Array], spots: list[Spot], count: int) -> Array:
+    """Pegs close beside cables, shape (count, 2), m; fewer where there is no room."""
+    chosen: list[Array] = []
+    lines = np.concatenate(cables)[:, :2]
+    for _ in range(_MAX_DRAWS):
+        if len(chosen) == count:
+            break
+        cable = cables[int(rng.integers(len(cables)))][:, :2]
+        i = int(rng.integers(1, len(cable) - 1))
+        along = cable[i + 1] - cable[i - 1]
+        aside = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+        point = cable[i] + rng.choice((-1.0, 1.0)) * rng.uniform(0.010, 0.016) * aside
+        clear = np.linalg.norm(lines - point, axis=1).min() >= 0.0095
+        clear &= all(np.hypot(s.x - point[0], s.y - point[1]) >= 0.026 for s in spots)
+        clear &= all(np.linalg.norm(point - other) >= 0.03 for other in chosen)
+        if clear:
+            chosen.append(point)
+    return np.reshape(chosen, (-1, 2))
+
+
 def _rivets(rng: np.random.Generator, cables: list[Array], spots: list[Spot], count: int) -> Array:
     """Rivets on free board, shape (count, 2), m; fewer where there is no room."""
     lines = np.concatenate(cables)[:, :2]
@@ -222,12 +252,16 @@ def draw_layout(rng: np.random.Generator, cfg: LayoutCfg | None = None) -> Palet
         ties = _ties(rng, cables, connectors, wanted + sitting, cfg.apart_m)
         if len(ties) < wanted + sitting:
             continue
+        pegs = _pegs(rng, cables, [*ties, *connectors], int(rng.integers(cfg.pegs[0], cfg.pegs[1] + 1)))
+        heights = rng.uniform(*cfg.peg_height_m, len(pegs))
+        taken = [*ties, *connectors, *(Spot(x, y, 0.0) for x, y in pegs)]
         count = int(rng.integers(cfg.rivets[0], cfg.rivets[1] + 1))
         return PaletteLayout(
             cables=tuple(cables),
             connectors=tuple(connectors),
             connector_height_m=rng.uniform(*cfg.connector_height_m, len(connectors)),
-            rivets=_rivets(rng, cables, [*ties, *connectors], count),
+            pegs=np.column_stack((pegs, heights)),
+            rivets=_rivets(rng, cables, taken, count),
             targets=tuple(ties[:wanted]),
             seated=tuple(ties[wanted:]),
         )

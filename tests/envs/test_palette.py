@@ -213,7 +213,7 @@ class Driver(PaletteExpert):
         memory = Memory(q=observation[45:51].astype(float), qd=np.zeros(6))
         tip = tip_kinematics(memory.q[None], np.zeros((1, 6))).pose[0]
         q, ways = memory.q, []
-        for goal in (self._point + np.array([0, 0, 0.07]), self._point - np.array([0, 0, self._below])):
+        for goal in (self._point + np.array([0, 0, 0.08]), self._point - np.array([0, 0, self._below])):
             pose = transform(np.eye(3), goal)
             ways.append(self._straight(q, tip, pose, self._cfg.press if ways else self._cfg.move))
             q, tip = ways[-1].q[-1], pose
@@ -258,13 +258,17 @@ def _rivet(env):
     return _in_world(env, np.array([*env.scene.layout.rivets[0], 0.003]))
 
 
+def _peg(env):
+    return _in_world(env, env.scene.layout.pegs[0])
+
+
 def _board(env):
     grid = np.stack(np.meshgrid(np.linspace(-0.16, 0.16, 33), np.linspace(-0.11, 0.11, 23)), -1).reshape(
         -1, 2
     )
     layout = env.scene.layout
     spots = np.array([s[:2] for s in (*layout.targets, *layout.seated, *layout.connectors)])
-    things = np.concatenate((np.concatenate(layout.cables)[:, :2], layout.rivets, spots))
+    things = np.concatenate((np.concatenate(layout.cables)[:, :2], layout.rivets, layout.pegs[:, :2], spots))
     best = grid[np.argmax(np.linalg.norm(grid[:, None] - things, axis=2).min(axis=1))]
     return _in_world(env, np.array([*best, 0.0]))
 
@@ -279,6 +283,7 @@ def _seated(env):
     [
         ("cable", _bare_cable),
         ("connector", _connector),
+        ("peg", _peg),
         ("rivet", _rivet),
         ("board", _board),
         ("tie", _seated),
