@@ -151,7 +151,10 @@ def _branch(start: Array, end: Array) -> Array:
 def _cables(rng: np.random.Generator, cfg: LayoutCfg) -> tuple[list[Array], list[Spot]]:
     trunk = _trunk(rng)
     cables = [trunk]
-    connectors = [Spot(x, y, np.pi / 2) for x, y, _ in (trunk[0] + [-0.012, 0, 0], trunk[-1] + [0.012, 0, 0])]
+    connectors = [
+        Spot(x, y, np.pi / 2)
+        for x, y, _ in (trunk[0] - np.array([0.01, 0, 0]), trunk[-1] + np.array([0.01, 0, 0]))
+    ]
     count = int(rng.integers(cfg.branches[0], cfg.branches[1] + 1))
     first = float(rng.choice((-1.0, 1.0)))
     slots = np.linspace(-0.11, 0.11, count) if count > 1 else np.zeros(1)
