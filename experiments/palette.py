@@ -96,10 +96,12 @@ def play(env: PaletteEnv, seed: int, pictures: list[NDArray[np.uint8]] | None = 
     observation, info = env.reset(seed=seed)
     seen_mm = _seen_mm(env)
     tips, commands, forces, home = [], [], [], []
-    while not done:
+    while True:
         tips.append(env.tip.pose[0, :3, 3].copy())
         commands.append(tip_kinematics(env.arm.q_command, env.arm.qd_command).pose[0, :3, 3])
         forces.append(info["force_n"])
+        if done:
+            break
         if pictures is not None and len(tips) % 2 == 1:
             pictures.append(_frame(env, info))
         action, memory = policy.predict(observation, memory)

@@ -12,6 +12,7 @@ from seal_gym.core.frames import Array
 from seal_gym.envs.palette_env import POSTURE, PaletteEnv
 from seal_gym.planning import multi_path
 from seal_gym.planning.multi_path import CubicWay
+from seal_gym.sim.palette_scene import BOARD_TOP_M
 from seal_gym.sim.tool_check import ToolCheck
 from seal_gym.vision.palette_threshold import red_mask
 from seal_gym.workpieces.palette import (
@@ -116,15 +117,14 @@ def jerk(path: Path, trace: Trace, seed: int) -> None:
     top.set_ylabel("jerk of the\ncommanded tip [m/s³]")
     bottom.plot(trace.time_s, trace.force_n, color=_ORANGE, lw=1.0)
     bottom.axhline(15.0, color=_GREY, lw=0.9, ls="--")
-    bottom.annotate(
-        "15 N", (trace.time_s[-1], 15.0), textcoords="offset points", xytext=(4, -3), color="#555"
-    )
+    bottom.annotate("15 N: enough", (0.0, 15.0), textcoords="offset points", xytext=(0, 4), color="#555")
     bottom.set_ylabel("force of the pad\non a tie [N]")
     bottom.set_xlabel("time [s]")
     for axes in (top, bottom):
         _bare(axes)
         for k, at in enumerate(trace.home_s):
             axes.axvline(at, color=_RED, lw=0.8, alpha=0.6, label="tie home" if k == 0 else None)
+    top.set_ylim(0.0, 1.25 * values.max())
     top.legend(loc="upper right", frameon=True)
     top.set_title(f"Palette {seed}: tau-Jerk motions from tie to tie")
     figure.savefig(path, dpi=120)
@@ -169,7 +169,7 @@ def paths(path: Path, env: PaletteEnv, trace: Trace, seed: int) -> None:
         foot = _MM * (env.part_pose[:3, :3] @ [x, y, 0.0] + env.part_pose[:3, 3])
         space.plot([foot[0]] * 2, [foot[1]] * 2, [foot[2], foot[2] + _MM * height], color=_PEG, lw=3)
     space.set_xlabel("x [mm]")
-    space.set_ylabel("y [mm]")
+    space.set_ylabel("y [mm]", labelpad=12)
     space.set_zlabel("z [mm]")
     space.set_box_aspect((1.0, 1.2, 0.6))
     space.view_init(elev=28, azim=-50)
@@ -201,10 +201,10 @@ def segmentation(path: Path, environments: Sequence[PaletteEnv], seeds: Sequence
         depth: NDArray[Any] = _MM * picture.depth_m
         row[0].imshow(picture.rgb)
         row[1].imshow(~red_mask(picture.rgb), cmap="gray", vmin=0, vmax=1)
-        shown = row[2].imshow(depth, cmap="viridis", vmin=790, vmax=920)
+        shown = row[2].imshow(depth, cmap="viridis", vmin=790, vmax=880)
         figure.colorbar(shown, ax=row[2], label="depth [mm]", shrink=0.8)
         for axes in row[:2]:
-            axes.plot(*_to_pixel(env, env.target_m).T, "+", color=_ORANGE, ms=11, mew=2)
+            axes.plot(*_to_pixel(env, env.target_m).T, "+", color=_ORANGE, ms=7, mew=1.5)
             axes.plot(*_to_pixel(env, env.place_m).T, "o", mfc="none", color="#00a0c0", ms=13, mew=1.6)
         row[0].set_ylabel(f"palette {seed}", fontsize=12)
     for axes, title in zip(
@@ -239,7 +239,7 @@ def ways(path: Path, seed: int) -> None:
     goal = env.target_m[np.argmax(env.target_m[:, 1])] + [0.0, 0.0, 0.008]
     starts: list[Array] = []
     while len(starts) < _SHOWN_STARTS:
-        point = rng.uniform((0.15, -0.45, 0.01), (0.55, -0.26, 0.06))
+        point = rng.uniform((0.15, -0.45, BOARD_TOP_M + 0.01), (0.55, -0.26, BOARD_TOP_M + 0.06))
         if check.free(point[None])[0]:
             starts.append(point)
     up = np.array([0.0, 0.0, 1.0])
@@ -258,7 +258,7 @@ def ways(path: Path, seed: int) -> None:
         _draw_way(above, side, best, color=_RED, lw=2.6)
         _draw_local(local, best)
     side.axhspan(0, 70, color=_PEG, alpha=0.12, lw=0)
-    side.annotate("height of pegs", (0.02, 64), xycoords=("axes fraction", "data"), color="#555", fontsize=9)
+    side.annotate("height of pegs", (0.02, 73), xycoords=("axes fraction", "data"), color="#555", fontsize=9)
     side.set_xlabel("distance left to the tie [mm]")
     side.set_ylabel("height over the board [mm]")
     side.invert_xaxis()
@@ -269,7 +269,7 @@ def ways(path: Path, seed: int) -> None:
         Line2D([], [], color=_BLUE, lw=1.8, label="best from each start"),
         Line2D([], [], color=_RED, lw=2.6, label="best of all"),
     ]
-    above.legend(handles=lines, loc="lower right", fontsize=9)
+    figure.legend(handles=lines, loc="outside lower center", ncols=3, frameon=False)
     above.set_title("from above")
     figure.suptitle(f"Palette {seed}: cubic ways from {_SHOWN_STARTS} starts to one tie")
     figure.savefig(path, dpi=110)
@@ -280,7 +280,7 @@ def _draw_way(above: Any, side: Any, way: CubicWay, **style: Any) -> None:
     points = _MM * way.equidistant(120)
     above.plot(points[:, 0], points[:, 1], **style)
     left = np.linalg.norm(points[:, :2] - points[-1, :2], axis=1)
-    side.plot(left, points[:, 2], **style)
+    side.plot(left, points[:, 2] - _MM * BOARD_TOP_M, **style)
 
 
 def _draw_local(axes: Any, way: CubicWay) -> None:

@@ -33,6 +33,7 @@ from seal_gym.envs.palette_env import POSTURE, PaletteEnv
 from seal_gym.planning import multi_path
 from seal_gym.planning.multi_path import CubicWay
 from seal_gym.planning.tau_jerk import unit_gap
+from seal_gym.sim.palette_scene import BOARD_TOP_M
 from seal_gym.sim.tool_check import ToolCheck
 
 try:  # an extra: without it the other methods are compared all the same
@@ -45,8 +46,9 @@ except ImportError:
 NAME = "palette_paths"
 UP = np.array([0.0, 0.0, 1.0])
 HOVER_M = 0.008
-SAFE_M = 0.085  # over the board: above every peg
-STARTS_LOW, STARTS_HIGH = np.array([0.15, -0.45, 0.01]), np.array([0.40, -0.26, 0.15])
+SAFE_M = BOARD_TOP_M + 0.08  # above every peg
+STARTS_LOW = np.array([0.15, -0.45, BOARD_TOP_M + 0.01])
+STARTS_HIGH = np.array([0.40, -0.26, BOARD_TOP_M + 0.15])
 MANY_STARTS = 8
 _CHECK_M, _PLAN_M = 0.002, 0.003  # clearances: judged, and planned with
 _STEP_M = 0.002
