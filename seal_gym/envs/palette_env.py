@@ -406,8 +406,8 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
             self._renderer = offscreen(self.scene.model, HEIGHT, WIDTH)
         option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
         option.geomgroup[GROUP_COLLISION] = 0
-        camera.lookat[:] = self.part_pose[:3, 3] + [-0.06, -0.04, 0.12]
-        camera.distance, camera.azimuth, camera.elevation = 0.95, 150.0, -32.0
+        camera.lookat[:] = self.part_pose[:3, 3] + [-0.03, -0.02, 0.07]
+        camera.distance, camera.azimuth, camera.elevation = 0.85, 150.0, -34.0
         self._renderer.update_scene(self.arm.data(0), camera=camera, scene_option=option)
         return np.asarray(self._renderer.render())
 

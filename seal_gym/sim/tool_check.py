@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from seal_gym.core.frames import Array, quat_from_matrix, transform
 from seal_gym.planning import ik, ik_kernel
 from seal_gym.sim.arm import ArmScene
+from seal_gym.sim.scene import ENVIRONMENT
 
 
 class ToolCheck:
@@ -24,10 +25,13 @@ class ToolCheck:
             scene: With the arm; its slides stay where they are at rest.
             part_pose: ``T_base_part``, shape (4, 4), m.
             posture: Near which the inverse kinematics stays, shape (6,), rad.
-            margin_m: Things nearer to each other than this collide [m].
+            margin_m: Things nearer than this to arm or tool collide with it [m].
         """
         self._model = copy.deepcopy(scene.model)
-        self._model.geom_margin[:] = margin_m
+        # Margins of a pair add up: only what stands around has one. The broad phase looks at the bodies'.
+        around = np.flatnonzero(self._model.geom_contype == ENVIRONMENT["contype"])
+        self._model.geom_margin[around] = margin_m
+        self._model.body_margin[self._model.geom_bodyid[around]] = margin_m
         self._data = mujoco.MjData(self._model)
         self._data.mocap_pos[0] = part_pose[:3, 3]
         self._data.mocap_quat[0] = quat_from_matrix(part_pose[:3, :3])
