@@ -265,7 +265,7 @@ def figures(out: Path, observer_name: str, seed: int) -> None:
     env = make("observer", observer_name)
     _, trace = play(env, seed)
     palette_figures.jerk(out / f"{NAME}_jerk.png", trace, seed)
-    palette_figures.paths(out / f"{NAME}_paths.png", env, trace, seed)
+    palette_figures.paths(out / f"{NAME}_tip.png", env, trace, seed)
     seeds = (seed, seed + 1)
     environments = [make("observer", observer_name) for _ in seeds]
     for shown, k in zip(environments, seeds, strict=True):

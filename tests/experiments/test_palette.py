@@ -27,7 +27,7 @@ def test_a_small_run_writes_its_files(tmp_path):
         "palette.csv",
         "palette.md",
         "palette_jerk.png",
-        "palette_paths.png",
+        "palette_tip.png",
         "palette_segmentation.png",
     ):
         assert (tmp_path / name).stat().st_size > 100
