@@ -286,8 +286,10 @@ def _draw_way(above: Any, side: Any, way: CubicWay, **style: Any) -> None:
 def _draw_local(axes: Any, way: CubicWay) -> None:
     """Both cubics of a way in its own frame, extrema and inflections marked."""
     x = way.along(300)
-    for cubic, label, colour in ((way.y, "y(x), aside", _BLUE), (way.z, "z(x), up", _RED)):
-        axes.plot(_MM * x, _MM * cubic(x), color=colour, lw=1.8, label=label)
+    # Where both are the same the broken line lets the other one through.
+    curves = ((way.y, "y(x), aside", _BLUE, "-"), (way.z, "z(x), up", _RED, (0, (4, 3))))
+    for cubic, label, colour, dashes in curves:
+        axes.plot(_MM * x, _MM * cubic(x), color=colour, lw=2.2, ls=dashes, label=label)
         extreme = multi_path.extrema(cubic)
         axes.plot(_MM * extreme.x, _MM * extreme.y, "^", color=colour, ms=9)
         bend = multi_path.inflections(cubic)
