@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as _gym
 
 __version__ = "0.1.0"
-__all__ = ["ENV_IDS", "Workpiece", "__version__"]
+__all__ = ["ENV_IDS", "PALETTE_ID", "Workpiece", "__version__"]
 
 if TYPE_CHECKING:
     from seal_gym.workpieces.workpiece import Workpiece
 
 ENV_IDS = ("SealGym/Flat-v0", "SealGym/Cylinder-v0", "SealGym/Rectangular-v0", "SealGym/Seal-v0")
+"""The sealing environments."""
+PALETTE_ID = "SealGym/Palette-v0"
+"""Ties on a cable-harness palette; one environment at a time."""
 
 
 def _register() -> None:
@@ -28,6 +31,8 @@ def _register() -> None:
             vector_entry_point="seal_gym.envs.vector:SealVectorEnv",
             kwargs={"workpiece": "flat" if part == "seal" else part},
         )
+    if PALETTE_ID not in _gym.registry:
+        _gym.register(PALETTE_ID, entry_point="seal_gym.envs.palette_env:PaletteEnv")
 
 
 def __getattr__(name: str) -> Any:

@@ -60,6 +60,14 @@ class ArmState:
     obstacle: Obstacle | None = None
 
 
+class TipState(Protocol):
+    """The part of an ``ArmState`` that direct control reads."""
+
+    @property
+    def tip(self) -> TipKinematics:
+        """Kinematics of the commanded motion."""
+
+
 LeafFunction = Callable[[ArmState], Leaf]
 
 
@@ -106,7 +114,7 @@ class TipAdapter:
         self._scale = tip_scale(cell.limits)
         self._metric = np.eye(6)[None]
 
-    def __call__(self, action: Array, state: ArmState) -> Array:
+    def __call__(self, action: Array, state: TipState) -> Array:
         """See ``Adapter``."""
         metric = np.broadcast_to(self._metric, (len(action), 6, 6))
         leaf = on_tip(action * self._scale, metric, state.tip.jacobian, state.tip.drift)
@@ -211,7 +219,7 @@ class JointAdapter:
         """
         self._scale = cell.limits.joint_rad_s2
 
-    def __call__(self, action: Array, state: ArmState) -> Array:
+    def __call__(self, action: Array, state: TipState) -> Array:
         """See ``Adapter``."""
         del state
         return action * self._scale

@@ -1,16 +1,16 @@
 """N arms over N parts, stepped together: joint accelerations in, joint states and contacts out."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
+from seal_gym.core.cell import CellCfg
 from seal_gym.core.errors import PhysicsError
 from seal_gym.core.frames import Array, quat_from_matrix
 from seal_gym.core.kinematics import JOINT_LOWER, JOINT_SPEED, JOINT_TORQUE, JOINT_UPPER
-from seal_gym.sim.scene import Scene
 
 _CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
 _OUTSIDE = int(
@@ -19,6 +19,18 @@ _OUTSIDE = int(
     | mujoco.mjtState.mjSTATE_MOCAP_POS
     | mujoco.mjtState.mjSTATE_MOCAP_QUAT
 )
+
+
+class ArmScene(Protocol):
+    """A compiled cell with the arm in it: its joints come first, and the part is the first mocap body."""
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The MuJoCo model."""
+
+    @property
+    def cell(self) -> CellCfg:
+        """The cell it was built for."""
 
 
 class Poses(NamedTuple):
@@ -68,22 +80,25 @@ class ArmBatch:
         q_command: Commanded joint angles, shape (N, 6), rad.
         qd_command: Commanded joint speeds, shape (N, 6), rad/s.
         part_pose: ``T_base_part``, shape (N, 4, 4), m.
+        recorded: What was asked to be recorded, after each physics step of the last frame, by its name in
+            ``MjData``, each of shape (N, S, ...).
     """
 
-    def __init__(self, scene: Scene, n: int, threads: int = 0) -> None:
+    def __init__(self, scene: ArmScene, n: int, threads: int = 0, record: tuple[str, ...] = ()) -> None:
         """Allocates N simulations.
 
         Args:
             scene: The compiled scene.
             n: Number of simulations, >= 1.
             threads: Threads to step them on, the caller's included; 0 and 1 mean the caller's alone.
+            record: Fields of ``MjData`` to record besides the number of contacts.
         """
         model = scene.model
         self.scene = scene
         self.n = n
         self._batch = Batch(model, n, nthread=max(threads, 0))
-        self.q: Array = self._batch.bind("qpos")
-        self.qd: Array = self._batch.bind("qvel")
+        self.q: Array = self._batch.bind("qpos")[:, :6]
+        self.qd: Array = self._batch.bind("qvel")[:, :6]
         self._mocap_pos: Array = self._batch.bind("mocap_pos")
         self._mocap_quat: Array = self._batch.bind("mocap_quat")
         self._force: Array = self._batch.bind("xfrc_applied")
@@ -101,6 +116,8 @@ class ArmBatch:
         # Leads at which position and speed servo alone ask for all the torque there is: more is windup.
         self._pull_q, self._pull_qd = JOINT_TORQUE / kp, JOINT_TORQUE / kv
         self._contact = {"ncon": np.zeros((n, steps), np.int32)}
+        self._record = ("ncon", *record)
+        self.recorded: dict[Any, NDArray[Any]] = {}
 
     def reset(self, i: int, q: Array, part_pose: Array) -> None:
         """Puts one simulation at rest.
@@ -154,15 +171,15 @@ class ArmBatch:
         target = start + t * (rate + 0.5 * t * a) + self._lead * (rate + self._t_end * a)
         inputs, spec = (target, _CTRL) if outside is None else (self._inputs(target, outside), _OUTSIDE)
         try:
-            touched = self._batch.rollout(target.shape[1], inputs, spec, record=("ncon",), out=self._contact)[
-                "ncon"
-            ]
+            self.recorded = self._batch.rollout(
+                target.shape[1], inputs, spec, record=self._record, out=self._contact
+            )
         except SimulationError as error:
             raise PhysicsError(f"MuJoCo stopped simulations {error.ids.tolist()}: {error}") from error
         if outside is not None:
             self._arrive(outside)
         self.q_command, self.qd_command = reached, speed
-        return np.asarray(touched.any(axis=1))
+        return np.asarray(self.recorded["ncon"].any(axis=1))
 
     def _inputs(self, target: Array, outside: Outside) -> Array:
         """Servo targets, forces and poses of each physics step, in the order of ``mjtState``'s bits."""
@@ -196,6 +213,15 @@ class ArmBatch:
             position: Of its centre in the base frame, shape (3,), m.
         """
         self._mocap_pos[i, 1] = position
+
+    def hold(self, i: int, constraint: int) -> None:
+        """Switches an equality constraint of one simulation on.
+
+        Args:
+            i: Which simulation.
+            constraint: Its number in the model.
+        """
+        self._batch.bind("eq_active")[i, constraint] = 1.0
 
     def data(self, i: int) -> mujoco.MjData:
         """One simulation's state as an ``MjData``, to render it or to look into it.

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 # Geom groups: what MuJoCo's viewer and our renderers switch on and off together.
 GROUP_FURNITURE, GROUP_PART, GROUP_ROBOT, GROUP_COLLISION = 0, 1, 2, 3
 # Robot geoms have contype 1 and conaffinity 3 (assets/ur5_sealgun): they hit each other and these.
-_ENVIRONMENT = {"contype": 2, "conaffinity": 1}
-_VISUAL = {"contype": 0, "conaffinity": 0}
+ENVIRONMENT = {"contype": 2, "conaffinity": 1}
+VISUAL = {"contype": 0, "conaffinity": 0}
 GUN_PREFIX = "gun/"
 PART_PREFIX = "col_part_"
 OBSTACLE = "obstacle"
@@ -54,7 +54,12 @@ class Scene:
     marker: "PartMarker | None" = None
 
 
-def _add_furniture(spec: mujoco.MjSpec) -> None:
+def add_furniture(spec: mujoco.MjSpec) -> None:
+    """Adds floor, table, pedestal, lamps and the camera ``scene`` to a cell.
+
+    Args:
+        spec: The cell, with the arm.
+    """
     spec.add_material(name="steel", rgba=[0.55, 0.56, 0.58, 1], specular=0.3)
     spec.add_material(name="bench", rgba=[0.46, 0.41, 0.36, 1], specular=0.1)
     spec.add_texture(
@@ -85,7 +90,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         size=[3, 3, 0.1],
         material="floor",
         group=GROUP_FURNITURE,
-        **_VISUAL,
+        **VISUAL,
     )
     thickness = 0.04
     world.add_geom(
@@ -95,7 +100,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         size=[0.52, 0.50, thickness / 2],
         material="bench",
         group=GROUP_FURNITURE,
-        **_ENVIRONMENT,
+        **ENVIRONMENT,
     )
     leg = (TABLE_TOP_M - thickness - _FLOOR_M) / 2
     for x in (-0.14, 0.78):
@@ -106,7 +111,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
                 size=[0.03, 0.03, leg],
                 material="steel",
                 group=GROUP_FURNITURE,
-                **_VISUAL,
+                **VISUAL,
             )
     height = -TABLE_TOP_M / 2
     world.add_geom(
@@ -116,7 +121,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
         size=[0.095, height, 0],
         material="steel",
         group=GROUP_FURNITURE,
-        **_ENVIRONMENT,
+        **ENVIRONMENT,
     )
     for k, (position, strength) in enumerate((((0.9, -0.7, 1.6), 0.55), ((-0.3, 0.9, 1.8), 0.35))):
         light = world.add_light(name=f"lamp{k}", pos=position, dir=np.subtract((0.35, 0, 0), position))
@@ -164,7 +169,7 @@ def _add_solid(body: mujoco.MjsBody, spec: mujoco.MjSpec, k: int, solid: Solid) 
         "quat": quat_from_matrix(solid.pose[:3, :3]),
         "group": GROUP_COLLISION,
         "rgba": [0.9, 0.4, 0.2, 0.4],
-        **_ENVIRONMENT,
+        **ENVIRONMENT,
     }
     if solid.kind == "box":
         body.add_geom(type=_G.mjGEOM_BOX, size=solid.size, **common)
@@ -211,7 +216,7 @@ def _add_part(spec: mujoco.MjSpec, workpiece: Workpiece) -> None:
             meshname=f"look_{material.name}",
             material=material.name,
             group=GROUP_PART,
-            **_VISUAL,
+            **VISUAL,
         )
     for k, solid in enumerate(workpiece.solids):
         _add_solid(part, spec, k, solid)
@@ -226,7 +231,7 @@ def _add_obstacle(spec: mujoco.MjSpec, radius_m: float) -> None:
         size=[radius_m, 0, 0],
         rgba=[*SKIN_RGB, 1.0],
         group=GROUP_PART,
-        **_ENVIRONMENT,
+        **ENVIRONMENT,
     )
 
 
@@ -291,7 +296,7 @@ def build_scene(
     gun = mujoco.MjSpec.from_file(str(asset("ur5_sealgun", "sealgun.xml")))
     spec.attach(gun, prefix=GUN_PREFIX, site=spec.site("tool0"))
     spec.option.timestep = cell.timing.step_s
-    _add_furniture(spec)
+    add_furniture(spec)
     _add_sensor_cameras(spec.body(GUN_PREFIX + "sealgun"), cell)
     _add_part(spec, workpiece)
     if obstacle_m > 0.0:
