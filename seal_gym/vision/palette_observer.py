@@ -186,4 +186,4 @@ def observe(
     """
     check_picture(rgb, depth_m, camera, inside)
     named = name_pixels(rgb, network or hopfield.exact(), cfg, inside)
-    return report_on(named, np.asarray(depth_m, dtype=np.float64), camera, cfg.regions, plan)
+    return report_on(named, rgb, np.asarray(depth_m, dtype=np.float64), camera, cfg.regions, plan)

@@ -7,6 +7,7 @@ from enum import StrEnum
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from seal_gym.core.cell import OverheadCfg
 from seal_gym.core.errors import is_number, require
@@ -15,6 +16,9 @@ from seal_gym.vision.palette_segments import Bytes, Mask, PaletteClass
 
 _PLANE_PX = 12  # fewer pixels give no plane, their median depth does
 _REFITS, _OUTLIER, _LEAST_RESIDUAL = 2, 3.0, 1e-4
+# Pixels this near to a region's outline are shared by it and its surroundings, whose colours are taken from
+# farther off; they have to differ by so much [grey levels].
+_OUTLINE_PX, _LEAST_DIFFERENCE = 2, 30.0
 
 
 class Fault(StrEnum):
@@ -224,8 +228,7 @@ def _hull(mask: Mask) -> Mask:
 
 def _tie(zone: Mask, white: Mask, least_px: float, rim_px: int) -> Mask | None:
     """The largest white area inside a target zone; None if it is small."""
-    kernel = np.ones((2 * rim_px + 1, 2 * rim_px + 1), dtype=np.uint8)
-    inside = cv2.erode(zone.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inside = cv2.erode(zone.astype(np.uint8), _square(rim_px), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     ties = list(_pieces((inside > 0) & white, 0.0, least_px))
     if not ties:
         return None
@@ -262,9 +265,54 @@ def _gather(named: NamedPixels, scale_m: float, cfg: RegionCfg) -> Iterator[_Reg
             yield _Region(kind=PaletteClass.UNKNOWN, whole=mask, seen=mask, fault=fault)
 
 
-def _centroid(mask: Mask) -> Array:
+def _square(radius_px: int) -> NDArray[np.uint8]:
+    return np.ones((2 * radius_px + 1, 2 * radius_px + 1), dtype=np.uint8)
+
+
+def _nearest_colour(where: Mask, colour: Array, pixels: Mask) -> Array:
+    index = ndimage.distance_transform_edt(~where, return_distances=False, return_indices=True)
+    return np.asarray(colour[tuple(index)][pixels])
+
+
+def coverage(mask: Mask, rgb: Bytes) -> Array:
+    """What share of each pixel a region covers, from how the colours mix along its outline.
+
+    Args:
+        mask: The region to about a pixel, shape (H, W).
+        rgb: Shape (H, W, 3).
+
+    Returns:
+        0..1, shape (H, W); 0 or 1 where the region is too thin or too like its surroundings to tell.
+    """
+    share = mask.astype(np.float64)
+    whole = mask.astype(np.uint8)
+    inner, outer = cv2.erode(whole, _square(_OUTLINE_PX)), cv2.dilate(whole, _square(_OUTLINE_PX))
+    within = cv2.erode(whole, _square(_OUTLINE_PX + 1)) > 0
+    without = cv2.dilate(whole, _square(_OUTLINE_PX + 1)) == 0
+    outline = (outer > 0) & (inner == 0)
+    if not (within.any() and without.any()):
+        return share
+    steady = cv2.medianBlur(rgb, 5).astype(np.float64)
+    ours = _nearest_colour(within, steady, outline)
+    across = ours - (theirs := _nearest_colour(without, steady, outline))
+    square = (across**2).sum(axis=1)
+    mixed = ((rgb[outline] - theirs) * across).sum(axis=1) / np.maximum(square, 1.0)
+    told = square >= _LEAST_DIFFERENCE**2
+    share[outline] = np.where(told, np.clip(mixed, 0.0, 1.0), share[outline])
+    return share
+
+
+def _centroid(mask: Mask, rgb: Bytes) -> tuple[Array, float]:
+    """Centroid and area of a region to a fraction of a pixel [px]."""
     rows, columns = np.nonzero(mask)
-    return np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+    margin = _OUTLINE_PX + 3
+    top, left = max(int(rows.min()) - margin, 0), max(int(columns.min()) - margin, 0)
+    crop = np.s_[top : int(rows.max()) + margin + 1, left : int(columns.max()) + margin + 1]
+    share = coverage(mask[crop], rgb[crop])
+    area = float(share.sum())
+    x = share.sum(axis=0) @ (np.arange(share.shape[1]) + left + 0.5) / area
+    y = share.sum(axis=1) @ (np.arange(share.shape[0]) + top + 0.5) / area
+    return np.array([x, y]), area
 
 
 def depth_at(point_px: Array, mask: Mask, depth_m: Array) -> float:
@@ -317,7 +365,7 @@ def back_project(point_px: Array, depth_m: float, camera: OverheadCfg) -> Array:
 
 def _place(position: Array, centroid: Array) -> str:
     if np.isfinite(position).all():
-        x, y, z = 1e3 * position
+        x, y, z = np.round(1e3 * position, 1) + 0.0  # no minus zero
         return f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
     return f"at pixel ({centroid[0]:.1f}, {centroid[1]:.1f})"
 
@@ -353,6 +401,7 @@ _WORDS = {
 
 def report_on(
     named: NamedPixels,
+    rgb: Bytes,
     depth_m: Array,
     camera: OverheadCfg,
     cfg: RegionCfg,
@@ -362,6 +411,7 @@ def report_on(
 
     Args:
         named: The pixels.
+        rgb: The picture they were named in, shape (H, W, 3).
         depth_m: Along the optical axis, shape (H, W), m; 0 or not finite where unknown.
         camera: The camera.
         cfg: Parameters.
@@ -378,14 +428,14 @@ def report_on(
     regions = list(_gather(named, float(np.median(known)) / camera.focal_px, cfg))
     labels = np.zeros(named.classes.shape, dtype=np.int32)
     n = len(regions)
-    centroids, positions, areas_mm2 = np.empty((n, 2)), np.empty((n, 3)), np.empty(n)
+    centroids, positions, areas_px, areas_mm2 = np.empty((n, 2)), np.empty((n, 3)), np.empty(n), np.empty(n)
     faults: list[PaletteFault] = []
     for k, region in enumerate(regions):
         labels[region.seen] = k + 1
-        centroids[k] = _centroid(region.whole)
+        centroids[k], areas_px[k] = _centroid(region.whole, rgb)
         depth = depth_at(centroids[k], region.seen, depth_m)
         positions[k] = back_project(centroids[k], depth, camera)
-        areas_mm2[k] = np.count_nonzero(region.whole) * (1e3 * depth / camera.focal_px) ** 2
+        areas_mm2[k] = areas_px[k] * (1e3 * depth / camera.focal_px) ** 2
         found = [region.fault] if region.fault else []
         found += [] if np.isfinite(depth) else [Fault.NO_DEPTH]
         for fault in found:
@@ -395,7 +445,7 @@ def report_on(
         classes=np.array([r.kind for r in regions], dtype=np.int8),
         centroids_px=centroids,
         positions_m=positions,
-        areas_px=np.array([np.count_nonzero(r.whole) for r in regions], dtype=np.float64),
+        areas_px=areas_px,
         areas_mm2=areas_mm2,
         labels=labels,
         faults=tuple(faults),
