@@ -69,6 +69,7 @@ def _scatter(axes: Any, seed: int) -> None:
         axes.plot(*np.insert(square, axis, level, axis=1).T, color="#444444", lw=1.0)
     axes.set(xlabel="red", ylabel="green", zlabel="blue", xlim=(0, 255), ylim=(0, 255), zlim=(0, 255))
     axes.view_init(elev=22, azim=-58)
+    axes.set_box_aspect(None, zoom=0.85)
     axes.set_title(f"pixels in RGB space, thresholds {levels}", fontsize=11)
     axes.legend(fontsize=9, loc="upper left", bbox_to_anchor=(-0.16, 0.98))
 
@@ -162,7 +163,7 @@ def stages(path: Path, seed: int) -> None:
         last = grid[row, -1]
         last.plot(*report.centroids_px.T, "+", color="black", ms=9, mew=2.6)
         last.plot(*report.centroids_px.T, "+", color="white", ms=7, mew=1.2, label="centroid")
-        marks = {Fault.MISSING_TIE: ("#ff9d00", "missing tie"), None: ("#c83cdc", "conflict or unknown")}
+        marks = {Fault.MISSING_TIE: ("#ff9d00", "missing tie"), None: ("black", "conflict or unknown")}
         for kind, (colour, label) in marks.items():
             regions = [f.region for f in report.faults if (f.kind is Fault.MISSING_TIE) == (kind is not None)]
             shown = report.centroids_px[np.array(regions, dtype=np.intp)]
@@ -193,7 +194,9 @@ def accuracy(path: Path, rows: list[Row], sweeps: dict[str, list[tuple[float, st
                 y = [found[light, method][key] for _, light in values]
                 x = [value for value, _ in values]
                 shown = [np.nan if v is None else v for v in y]
-                axes.plot(x, shown, line, marker=mark, ms=4.5, color=colour, label=method)
+                # Triangles are large and hollow: most of them lie on the observer's points.
+                size = {"ms": 9.0, "mfc": "none"} if mark == "^" else {"ms": 4.5}
+                axes.plot(x, shown, line, marker=mark, color=colour, label=method, **size)
             axes.grid(color="#dddddd", lw=0.6)
             axes.set(ylim=(-3, 103), xlabel=_UNITS[name] if row else "")
             if column == 0:

@@ -185,5 +185,6 @@ def observe(
         ConfigError: If picture, depth, camera or mask do not fit one another, or no pixel has a depth.
     """
     check_picture(rgb, depth_m, camera, inside)
+    rgb = np.ascontiguousarray(rgb)  # OpenCV takes no flipped views
     named = name_pixels(rgb, network or hopfield.exact(), cfg, inside)
     return report_on(named, rgb, np.asarray(depth_m, dtype=np.float64), camera, cfg.regions, plan)

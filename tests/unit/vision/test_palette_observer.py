@@ -306,6 +306,16 @@ def test_observing_changes_no_input_and_repeats():
     np.testing.assert_array_equal(name_pixels(rgb, hopfield.exact(), PaletteObserverCfg()).conflict, False)
 
 
+def test_flipped_views_and_single_precision_are_taken():
+    canvas = zone(Canvas(), tie=True)
+    rgb, depth = canvas.rgb, canvas.depth
+    mirrored = observe(rgb[:, ::-1], depth[:, ::-1].astype(np.float32), CAMERA)
+    plain = observe(np.ascontiguousarray(rgb[:, ::-1]), depth, CAMERA)
+    np.testing.assert_allclose(mirrored.positions_m, plain.positions_m, atol=1e-6)
+    (target,) = mirrored.of(PaletteClass.TARGET)
+    np.testing.assert_allclose(mirrored.centroids_px[target], (200.0, 105.0), atol=0.1)
+
+
 RGB, DEPTHS = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), np.ones((HEIGHT, WIDTH))
 
 
