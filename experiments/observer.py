@@ -9,7 +9,6 @@ figures.
 
 import argparse
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from tqdm import tqdm
 
+from agents import engines
 from experiments import command, observer_figures, palette_methods, palette_pictures, results
 from experiments.palette_pictures import CAMERA, LightCfg, Palette
 from seal_gym.core.frames import Array
@@ -342,11 +342,9 @@ def main(arguments: list[str] | None = None) -> int:
     def work() -> str:
         results.log_run(NAME, "Palette observer", options.seed + options.trials - 1)
         seeds = range(options.seed, options.seed + options.trials)
-        if options.jobs == 1:
-            found = [trial(seed) for seed in tqdm(seeds, "palettes")]
-        else:
-            with ProcessPoolExecutor(options.jobs) as pool:
-                found = list(tqdm(pool.map(trial, seeds), "palettes", total=len(seeds)))
+        done = tqdm(engines.local(options.jobs)(trial, seeds), "palettes", total=len(seeds))
+        # In the order of the seeds, so that sums of floats repeat.
+        found = [counts for _, counts in sorted(done, key=lambda unit: unit[0])]
         rows, recall, masks = summarised(found, options.seed), recall_rows(), mask_rows(options.seed)
         text = _text(rows, recall, masks)
         results.write(
