@@ -1,6 +1,6 @@
 """The Hopfield palette observer: what its networks recall, and how well it sees in changing light and noise.
 
-    python -m experiments.observer --trials 20 --seed 500000 --jobs 2 --out experiments/results
+    python -m experiments.observer --trials 12 --seed 500000 --jobs 2 --out experiments/results
 
 After Carvajal and Martinez-Garcia, section IV, Figs. 4 and 6. Every method sees the same drawn palettes in
 the same lights, and shares all that follows the naming of pixels. Writes observer.json, .csv, .md and three
@@ -321,7 +321,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.observer", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("--trials", type=int, default=20, help="palettes (default: %(default)s)")
+    parser.add_argument("--trials", type=int, default=12, help="palettes (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=500_000, help="of the first (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
