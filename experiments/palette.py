@@ -2,10 +2,10 @@
 
     python -m experiments.palette --trials 100 --seed 500000 --jobs 2 --out experiments/results
 
-With ``--perception oracle`` the policy is told where the targets are, with ``observer`` it gets what an
-observer made of one noisy RGB-D picture: ``--observer MODULE:FUNCTION``, by default the plain colour
-threshold. Completed: all ties home and nothing else touched. Writes palette.json, .csv, .md, figures of the
-first palette and, where OpenGL works, palette.mp4.
+With ``--perception oracle`` the policy is told where the targets are, with ``hopfield`` and ``threshold`` it
+gets what that observer made of one noisy RGB-D picture; ``--perception MODULE:FUNCTION`` runs another one.
+Completed: all ties home and nothing else touched. Writes palette.json, .csv, .md, figures of the first
+palette by the first observer named and, where OpenGL works, palette.mp4.
 """
 
 from experiments import backend
@@ -31,12 +31,14 @@ from experiments import command, palette_figures, results
 from experiments.palette_figures import Trace
 from seal_gym.core.errors import ConfigError, RenderError
 from seal_gym.core.kinematics import tip_kinematics
+from seal_gym.envs.palette_config import PaletteCfg
 from seal_gym.envs.palette_env import PaletteEnv
-from seal_gym.vision.palette_threshold import Observer
+from seal_gym.vision import palette_threshold
+from seal_gym.vision.palette_seen import Observer
 
 NAME = "palette"
-PERCEPTIONS = ("oracle", "observer")
-PLAIN = "seal_gym.vision.palette_threshold:observe"
+HOPFIELD = "hopfield"
+PERCEPTIONS = ("oracle", HOPFIELD, "threshold")
 _FRAMES_S = 30
 _INSET = (240, 288)  # width and height of the camera's picture in the video
 
@@ -47,7 +49,7 @@ def observer(name: str) -> Observer:
     """An observer by its name.
 
     Args:
-        name: ``MODULE:FUNCTION``.
+        name: ``hopfield``, ``threshold`` or ``MODULE:FUNCTION``.
 
     Returns:
         It.
@@ -55,20 +57,26 @@ def observer(name: str) -> Observer:
     Raises:
         ConfigError: If there is none of that name.
     """
+    if name == HOPFIELD:
+        return PaletteCfg().observer
+    if name == "threshold":
+        return palette_threshold.observe
     module, _, function = name.partition(":")
     try:
         found: Observer = getattr(import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"--observer {name!r}: must be MODULE:FUNCTION of an observer ({error})") from error
+        raise ConfigError(
+            f"--perception {name!r}: must be one of {', '.join(PERCEPTIONS)} or MODULE:FUNCTION of an "
+            f"observer ({error})"
+        ) from error
     return found
 
 
-def make(perception: str, observer_name: str, render_mode: str | None = None) -> PaletteEnv:
+def make(perception: str, render_mode: str | None = None) -> PaletteEnv:
     """The environment of a kind of perception.
 
     Args:
-        perception: One of ``PERCEPTIONS``.
-        observer_name: See ``observer``.
+        perception: ``oracle`` or an observer's name.
         render_mode: Of the environment.
 
     Returns:
@@ -77,7 +85,7 @@ def make(perception: str, observer_name: str, render_mode: str | None = None) ->
     if perception == "oracle":
         return PaletteEnv(control="joint", perception="oracle", render_mode=render_mode)
     return PaletteEnv(
-        control="joint", perception="vision", observer=observer(observer_name), render_mode=render_mode
+        control="joint", perception="vision", observer=observer(perception), render_mode=render_mode
     )
 
 
@@ -125,18 +133,17 @@ def _seen_mm(env: PaletteEnv) -> Row:
     }
 
 
-def run(perception: str, observer_name: str, seed: int) -> Row:
+def run(perception: str, seed: int) -> Row:
     """One trial.
 
     Args:
-        perception: One of ``PERCEPTIONS``.
-        observer_name: See ``observer``.
+        perception: See ``make``.
         seed: Of the palette.
 
     Returns:
         Its metrics.
     """
-    metrics, _ = play(make(perception, observer_name), seed)
+    metrics, _ = play(make(perception), seed)
     return {"perception": perception, "seed": seed, **metrics}
 
 
@@ -234,19 +241,19 @@ def _frame(env: PaletteEnv, info: Row) -> NDArray[np.uint8]:
     return out
 
 
-def video(path: Path, observer_name: str, seed: int) -> None:
+def video(path: Path, perception: str, seed: int) -> None:
     """Films one run, at twice real time.
 
     Args:
         path: The MP4.
-        observer_name: See ``observer``.
+        perception: An observer's name.
         seed: Of the palette.
 
     Raises:
         RenderError: If no picture can be made here.
     """
     frames: list[NDArray[np.uint8]] = []
-    env = make("observer", observer_name, "rgb_array")
+    env = make(perception, "rgb_array")
     play(env, seed, frames)
     env.close()
     with open_video(path) as writer:
@@ -254,20 +261,20 @@ def video(path: Path, observer_name: str, seed: int) -> None:
             writer.append_data(frame)
 
 
-def figures(out: Path, observer_name: str, seed: int) -> None:
+def figures(out: Path, perception: str, seed: int) -> None:
     """Makes the figures of one palette.
 
     Args:
         out: The folder.
-        observer_name: See ``observer``.
+        perception: An observer's name.
         seed: Of the palette.
     """
-    env = make("observer", observer_name)
+    env = make(perception)
     _, trace = play(env, seed)
     palette_figures.jerk(out / f"{NAME}_jerk.png", trace, seed)
     palette_figures.paths(out / f"{NAME}_tip.png", env, trace, seed)
     seeds = (seed, seed + 1)
-    environments = [make("observer", observer_name) for _ in seeds]
+    environments = [make(perception) for _ in seeds]
     for shown, k in zip(environments, seeds, strict=True):
         shown.reset(seed=k)
     palette_figures.segmentation(out / f"{NAME}_segmentation.png", environments, seeds)
@@ -288,9 +295,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--trials", type=int, default=10, help="of each perception (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=500_000, help="of the first trial (default: %(default)s)")
     parser.add_argument(
-        "--perception", action="append", choices=PERCEPTIONS, help="may be repeated (default: both)"
+        "--perception",
+        action="append",
+        help=f"{', '.join(PERCEPTIONS)} or MODULE:FUNCTION; may be repeated (default: the first three)",
     )
-    parser.add_argument("--observer", default=PLAIN, help="MODULE:FUNCTION (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
     parser.add_argument("--no-video", action="store_true", help="the figures need no OpenGL")
@@ -309,23 +317,27 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
 
     def do() -> str:
-        observer(options.observer)
+        perceptions = options.perception or PERCEPTIONS
+        seen = [p for p in perceptions if p != "oracle"]
+        for name in seen:
+            observer(name)
         results.log_run(NAME, "Palettes", options.seed + options.trials - 1)
         seeds, rows = list(range(options.seed, options.seed + options.trials)), []
-        for perception in options.perception or PERCEPTIONS:
-            work = partial(run, perception, options.observer)
+        for perception in perceptions:
+            work = partial(run, perception)
             done = engines.local(options.jobs)(work, seeds)
             by_seed = dict(tqdm(done, total=len(seeds), desc=perception))
             rows += [by_seed[seed] for seed in seeds]
         table = summarise(rows)
         text = markdown(table)
         results.write(options.out, NAME, table, rows, renderer="raycast", regime="static", text=text)
-        figures(options.out, options.observer, options.seed)
+        shown = seen[0] if seen else HOPFIELD
+        figures(options.out, shown, options.seed)
         if not options.no_video:
             try:
                 if _GL == "disabled":
                     raise RenderError("OpenGL is missing here")
-                video(options.out / f"{NAME}.mp4", options.observer, options.seed)
+                video(options.out / f"{NAME}.mp4", shown, options.seed)
             except RenderError as error:
                 sys.stderr.write(f"no video: {error}\n")
         return text

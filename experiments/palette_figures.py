@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seal_gym.core.frames import Array
+from seal_gym.envs.palette_config import PaletteCfg
 from seal_gym.envs.palette_env import POSTURE, PaletteEnv
 from seal_gym.planning import multi_path
 from seal_gym.planning.multi_path import CubicWay
 from seal_gym.sim.palette_scene import BOARD_TOP_M
+from seal_gym.sim.rgbd import Picture
 from seal_gym.sim.tool_check import ToolCheck
-from seal_gym.vision.palette_threshold import red_mask
+from seal_gym.vision.palette_segments import PaletteClass
+from seal_gym.vision.palette_ties import TieObserver
 from seal_gym.workpieces.palette import (
     BOARD_M,
     CABLE_RADIUS_M,
@@ -27,6 +30,7 @@ from seal_gym.workpieces.palette import (
 
 mpl.use("Agg")  # no screen needed
 import matplotlib.pyplot as plt  # the backend has to be chosen first
+from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
@@ -34,6 +38,15 @@ _MM = 1e3
 _BLUE, _RED, _GREY, _ORANGE = "#1f5fa8", "#d1382c", "#8a8f98", "#e8883a"
 _CONNECTOR, _PEG, _RIVET, _BOARD = "#5468c8", "#8a8f98", "#3f9d54", "#efeeea"
 _SHOWN_STARTS = 8
+_NAMED = {
+    PaletteClass.PALETTE: "#f7f7f5",
+    PaletteClass.CABLE: "#303030",
+    PaletteClass.CONNECTOR: _CONNECTOR,
+    PaletteClass.RIVET: _RIVET,
+    PaletteClass.TARGET: _RED,
+    PaletteClass.TIE: "#f2c14e",
+    PaletteClass.UNKNOWN: "#b04fc0",
+}
 
 
 class Trace(NamedTuple):
@@ -186,8 +199,18 @@ def _to_pixel(env: PaletteEnv, points: Array) -> Array:
     return np.asarray(camera.focal_px * local[:, :2] / local[:, 2:] + [width / 2, height / 2])
 
 
+def _named(picture: Picture, env: PaletteEnv) -> NDArray[Any]:
+    """The observer's regions in the colours of ``_NAMED``, shape (H, W, 4)."""
+    observer = env.cfg.observer if isinstance(env.cfg.observer, TieObserver) else PaletteCfg().observer
+    assert isinstance(observer, TieObserver)
+    report = observer.report(picture.rgb, picture.depth_m, env.cfg.camera)
+    of_region = np.append(np.int8(PaletteClass.PALETTE), report.classes)
+    colours = np.array([to_rgba(_NAMED[kind]) for kind in PaletteClass])
+    return np.asarray(colours[of_region[report.labels]])
+
+
 def segmentation(path: Path, environments: Sequence[PaletteEnv], seeds: Sequence[int]) -> None:
-    """What the camera saw, what the threshold made of it, and where the targets are.
+    """What the camera saw, what the Hopfield observer made of it, and where the targets are.
 
     Args:
         path: The PNG.
@@ -200,7 +223,7 @@ def segmentation(path: Path, environments: Sequence[PaletteEnv], seeds: Sequence
         picture = env.picture
         depth: NDArray[Any] = _MM * picture.depth_m
         row[0].imshow(picture.rgb)
-        row[1].imshow(~red_mask(picture.rgb), cmap="gray", vmin=0, vmax=1)
+        row[1].imshow(_named(picture, env))
         shown = row[2].imshow(depth, cmap="viridis", vmin=790, vmax=880)
         figure.colorbar(shown, ax=row[2], label="depth [mm]", shrink=0.8)
         for axes in row[:2]:
@@ -208,7 +231,7 @@ def segmentation(path: Path, environments: Sequence[PaletteEnv], seeds: Sequence
             axes.plot(*_to_pixel(env, env.place_m).T, "o", mfc="none", color="#00a0c0", ms=13, mew=1.6)
         row[0].set_ylabel(f"palette {seed}", fontsize=12)
     for axes, title in zip(
-        grid[0], ("picture", "red by threshold (black)", "depth (white: none)"), strict=True
+        grid[0], ("picture", "areas named by the Hopfield observer", "depth (white: none)"), strict=True
     ):
         axes.set_title(title)
     for axes in grid.ravel():
@@ -220,7 +243,12 @@ def segmentation(path: Path, environments: Sequence[PaletteEnv], seeds: Sequence
             [], [], ls="", marker="o", mfc="none", color="#00a0c0", ms=12, mew=1.6, label="target as seen"
         ),
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=2, frameon=False)
+    marks += [
+        Line2D([], [], ls="", marker="s", color=colour, ms=10, label=kind.name.lower())
+        for kind, colour in _NAMED.items()
+        if kind is not PaletteClass.PALETTE
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=100)
     plt.close(figure)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from seal_gym.core.cell import OverheadCfg
 from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
-from seal_gym.vision.palette_regions import back_project
+from seal_gym.vision.palette_seen import deproject
 from seal_gym.vision.palette_segments import Bytes, PaletteClass
 
 # As the cell's overhead camera, with a window of the board's size.
@@ -239,7 +239,7 @@ def draw(elements: list[Element], rng: np.random.Generator) -> Palette:
         if element.kind == PaletteClass.CABLE:
             rows, columns = np.nonzero(index == k)
             centroid = (np.array([columns.mean(), rows.mean()]) + 0.5) / _FINE
-            position = back_project(centroid, float(depths[k]), CAMERA)
+            position = deproject(centroid, float(depths[k]), CAMERA)
         else:
             position = _world_m(element.outline_mm.mean(axis=0), element.kind)
             centroid = project(position)

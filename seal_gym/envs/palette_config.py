@@ -8,9 +8,11 @@ import numpy as np
 from seal_gym.core.cell import CellCfg, OverheadCfg, load_cell
 from seal_gym.core.errors import ConfigError, is_number, require
 from seal_gym.sim.look import LookCfg
+from seal_gym.sim.palette_scene import BOARD_TOP_M
 from seal_gym.sim.rgbd import DepthNoiseCfg
 from seal_gym.tasks.pressing import PressRewardCfg, PressTaskCfg
-from seal_gym.vision.palette_threshold import Observer, observe
+from seal_gym.vision.palette_seen import Observer
+from seal_gym.vision.palette_ties import TieObserver
 from seal_gym.workpieces.palette import LayoutCfg
 
 CONTROLS = ("tip", "joint")
@@ -72,6 +74,11 @@ def _light() -> LookCfg:
     return LookCfg(lamp_x=(-0.6, 0.6), lamp_y=(-0.6, 0.6), blur_px=0.0)
 
 
+def _observer() -> TieObserver:
+    """What is clearly above the table is the palette."""
+    return TieObserver(floor_m=BOARD_TOP_M - 0.03)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaletteCfg:
     """How the palette environment is put together.
@@ -81,7 +88,8 @@ class PaletteCfg:
         perception: ``"vision"``: the features tell where ``observer`` saw the targets in the picture taken at
             the start; ``"oracle"``: where they are.
         observation: ``"features"`` or ``"features+images"``.
-        observer: ``observe(rgb, depth_m, camera)``, see ``seal_gym.vision.palette_threshold.Observer``.
+        observer: see ``seal_gym.vision.palette_seen.Observer``; the Hopfield
+            observer by default.
         layout: Ranges of the palettes.
         placement: Where palette and tool are at first.
         task: What counts as done, and when an episode ends.
@@ -95,7 +103,7 @@ class PaletteCfg:
     control: str = "tip"
     perception: str = "vision"
     observation: str = "features"
-    observer: Observer = observe
+    observer: Observer = field(default_factory=_observer)
     layout: LayoutCfg = field(default_factory=LayoutCfg)
     placement: PlacementCfg = field(default_factory=PlacementCfg)
     task: PressTaskCfg = field(default_factory=PressTaskCfg)

@@ -29,7 +29,7 @@ from seal_gym.sim.palette_scene import (
 from seal_gym.sim.rgbd import Picture, RgbdCamera
 from seal_gym.sim.scene import GROUP_COLLISION
 from seal_gym.tasks.pressing import Events, Pressing, reward
-from seal_gym.vision.palette_threshold import targets_of
+from seal_gym.vision.palette_seen import targets_of
 from seal_gym.workpieces.palette import MAX_TARGETS, draw_layout
 
 _MM, _DEG = 1e3, float(np.rad2deg(1.0))

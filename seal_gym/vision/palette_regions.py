@@ -12,6 +12,7 @@ from scipy import ndimage
 from seal_gym.core.cell import OverheadCfg
 from seal_gym.core.errors import is_number, require
 from seal_gym.core.frames import Array
+from seal_gym.vision.palette_seen import deproject
 from seal_gym.vision.palette_segments import Bytes, Mask, PaletteClass
 
 _PLANE_PX = 12  # fewer pixels give no plane, their median depth does
@@ -348,21 +349,6 @@ def depth_at(point_px: Array, mask: Mask, depth_m: Array) -> float:
     return middle / level if 0.5 < level < 2.0 else middle
 
 
-def back_project(point_px: Array, depth_m: float, camera: OverheadCfg) -> Array:
-    """The point of the world that is seen at a pixel.
-
-    Args:
-        point_px: Shape (2,), px.
-        depth_m: Along the optical axis [m].
-        camera: The camera.
-
-    Returns:
-        Shape (3,), m.
-    """
-    ray = np.linalg.inv(camera.matrix) @ np.array([*point_px, 1.0])
-    return np.asarray(camera.pose[:3, :3] @ (depth_m * ray) + camera.pose[:3, 3])
-
-
 def _place(position: Array, centroid: Array) -> str:
     if np.isfinite(position).all():
         x, y, z = np.round(1e3 * position, 1) + 0.0  # no minus zero
@@ -434,7 +420,7 @@ def report_on(
         labels[region.seen] = k + 1
         centroids[k], areas_px[k] = _centroid(region.whole, rgb)
         depth = depth_at(centroids[k], region.seen, depth_m)
-        positions[k] = back_project(centroids[k], depth, camera)
+        positions[k] = deproject(centroids[k], depth, camera)
         areas_mm2[k] = areas_px[k] * (1e3 * depth / camera.focal_px) ** 2
         found = [region.fault] if region.fault else []
         found += [] if np.isfinite(depth) else [Fault.NO_DEPTH]

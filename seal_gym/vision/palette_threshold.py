@@ -1,11 +1,4 @@
-"""A plain observer of palettes: colour thresholds and connected components on an RGB-D picture.
-
-Stands where a learned observer may stand: any function of a picture, its depth and the camera that gives
-``position_m`` and ``classes``.
-"""
-
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+"""A plain observer of palettes: colour thresholds and connected components on an RGB-D picture."""
 
 import cv2
 import numpy as np
@@ -13,68 +6,13 @@ from numpy.typing import NDArray
 
 from seal_gym.core.cell import OverheadCfg
 from seal_gym.core.frames import Array
+from seal_gym.vision.palette_seen import Depth, Regions, deproject
 
-Depth = NDArray[np.floating[Any]]
-TARGET_CLASSES = ("target", "tie")
-"""Names for what has to be pressed: paper T's Table I calls it tie, Table II target."""
 _REDNESS = 0.22  # of the board's brightness over the black of the cables
 _CLOSE_M = 0.010  # more than a cable's width, less than what lies between two zones
 _LEAST_M2 = 8e-5
 _ABOVE_BOARD_M = 0.013
 _REACH_M = 0.008
-
-
-class Seen(Protocol):
-    """What an observer gives."""
-
-    @property
-    def position_m(self) -> Array:
-        """Middles of the tops of what was seen in the world frame, shape (n, 3), m."""
-
-    @property
-    def classes(self) -> Sequence[str]:
-        """What each is."""
-
-
-class Observer(Protocol):
-    """Finds things in a picture."""
-
-    def __call__(self, rgb: NDArray[np.uint8], depth_m: Depth, camera: OverheadCfg) -> Seen:
-        """Looks.
-
-        Args:
-            rgb: Shape (H, W, 3).
-            depth_m: Along the optical axis, NaN where there is none, shape (H, W), m.
-            camera: Which took it.
-
-        Returns:
-            What is there.
-        """
-
-
-class Regions(NamedTuple):
-    """What ``observe`` has found.
-
-    Attributes:
-        position_m: In the world frame, shape (n, 3), m.
-        classes: ``"target"`` for each.
-    """
-
-    position_m: Array
-    classes: tuple[str, ...]
-
-
-def targets_of(seen: Seen) -> Array:
-    """The targets among what was seen.
-
-    Args:
-        seen: From an observer.
-
-    Returns:
-        Shape (n, 3), m.
-    """
-    chosen = [k for k, name in enumerate(seen.classes) if name in TARGET_CLASSES]
-    return np.reshape(np.asarray(seen.position_m, dtype=np.float64)[chosen], (-1, 3))
 
 
 def red_mask(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -93,23 +31,6 @@ def red_mask(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     scale = max(float(light - black), 1.0)
     redness = smooth[..., 0] - smooth[..., 1:].max(axis=2)
     return np.asarray(redness > _REDNESS * scale)
-
-
-def deproject(pixel: Array, depth_m: Array | float, camera: OverheadCfg) -> Array:
-    """Points of the world from pixels and depths.
-
-    Args:
-        pixel: Continuous pixel coordinates, shape (..., 2).
-        depth_m: Along the optical axis, shape (...), m.
-        camera: Which saw them.
-
-    Returns:
-        Shape (..., 3), m.
-    """
-    width, height = camera.frame_px
-    ray = (np.asarray(pixel) - [width / 2, height / 2]) / camera.focal_px
-    local = np.concatenate((ray, np.ones((*ray.shape[:-1], 1))), axis=-1) * np.asarray(depth_m)[..., None]
-    return np.asarray(local @ camera.pose[:3, :3].T + camera.pose[:3, 3])
 
 
 def observe(rgb: NDArray[np.uint8], depth_m: Depth, camera: OverheadCfg) -> Regions:

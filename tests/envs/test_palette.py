@@ -1,6 +1,8 @@
 """The palette environment: interface, determinism, contacts, and the scripted policy."""
 
+import math
 import pickle
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,8 +16,10 @@ from seal_gym.core.frames import transform
 from seal_gym.core.kinematics import tip_kinematics
 from seal_gym.envs.palette_env import PALETTE_ROWS, WRONG, PaletteEnv
 from seal_gym.planning.tau_jerk import RateLimitsCfg
-from seal_gym.vision.palette_threshold import Regions
-from seal_gym.workpieces.palette import MAX_TARGETS, LayoutCfg, draw_layout
+from seal_gym.vision import palette_threshold
+from seal_gym.vision.palette_seen import Regions
+from seal_gym.vision.palette_segments import PaletteClass
+from seal_gym.workpieces.palette import BOARD_M, MAX_TARGETS, LayoutCfg, draw_layout
 
 
 @pytest.fixture
@@ -161,13 +165,30 @@ def test_the_places_are_the_targets_seen_from_the_tip(make):
     assert info["targets"] == n and info["progress"] == 0.0
 
 
-def test_the_plain_observer_finds_the_targets_under_the_sensor_realism(make):
-    env = make()
+@pytest.mark.parametrize(("name", "largest_m"), [("hopfield", 0.004), ("threshold", 0.006)])
+def test_observers_find_the_targets_under_the_sensor_realism(make, name, largest_m):
+    env = make() if name == "hopfield" else make(observer=palette_threshold.observe)
     for seed in range(500_000, 500_020):
         env.reset(seed=seed)
         away = np.linalg.norm(env.place_m[:, None] - env.target_m, axis=2)
         assert away.shape[0] == away.shape[1], seed
-        assert away.min(axis=0).max() < 0.006 and len(set(away.argmin(axis=0))) == len(env.target_m)
+        assert away.min(axis=0).max() < largest_m and len(set(away.argmin(axis=0))) == len(env.target_m)
+
+
+def test_the_tie_observer_tells_the_palette_from_the_table(make):
+    env = make()
+    env.reset(seed=0)
+    observer = env.cfg.observer
+    seen = observer.report(env.picture.rgb, env.picture.depth_m, env.cfg.camera)
+    layout = env.scene.layout
+    assert len(seen.of(PaletteClass.RIVET)) == len(layout.rivets)
+    assert len(seen.of(PaletteClass.CONNECTOR)) == len(layout.connectors)
+    board = env.part_pose[:3, 3]
+    assert np.linalg.norm(seen.positions_m[:, :2] - board[:2], axis=1).max() < np.hypot(*BOARD_M[:2]) / 2
+    with pytest.raises(ConfigError, match="floor_m"):
+        replace(observer, floor_m=5.0).report(env.picture.rgb, env.picture.depth_m, env.cfg.camera)
+    with pytest.raises(ConfigError, match="floor_m"):
+        replace(observer, floor_m=math.nan)
 
 
 def test_any_observer_can_be_used(make):

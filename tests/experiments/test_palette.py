@@ -17,8 +17,8 @@ def test_a_small_run_writes_its_files(tmp_path):
     arguments = ["--trials", "2", "--out", str(tmp_path), "--no-video"]
     assert palette.main(arguments) == 0
     document = json.loads((tmp_path / "palette.json").read_text())
-    assert [r["perception"] for r in document["rows"]] == ["oracle", "observer"]
-    assert [t["seed"] for t in document["trials"]] == [500_000, 500_001] * 2
+    assert [r["perception"] for r in document["rows"]] == ["oracle", "hopfield", "threshold"]
+    assert [t["seed"] for t in document["trials"]] == [500_000, 500_001] * 3
     for row in document["rows"]:
         mine = [t for t in document["trials"] if t["perception"] == row["perception"]]
         assert row["completed_pct"] == 50.0 * sum(t["completed"] for t in mine)
@@ -31,7 +31,7 @@ def test_a_small_run_writes_its_files(tmp_path):
         "palette_segmentation.png",
     ):
         assert (tmp_path / name).stat().st_size > 100
-    again = palette.run("oracle", palette.PLAIN, 500_000)
+    again = palette.run("oracle", 500_000)
     assert json.loads(json.dumps(again)) == document["trials"][0]
 
 
@@ -39,7 +39,7 @@ def test_rows_by_hand():
     base = {
         "seed": 5, "targets": 4, "targets_done": 4, "wrong_touches": 0, "timeout": False, "collision": False,
         "completed": True, "path_mm": 1000.0, "peak_jerk_m_s3": 10.0, "peak_force_n": 50.0, "time_s": 10.0,
-        "missed": 0, "invented": 0, "place_error_mm": 1.0, "perception": "observer",
+        "missed": 0, "invented": 0, "place_error_mm": 1.0, "perception": "hopfield",
     }  # fmt: skip
     other = base | {"seed": 4, "targets_done": 2, "completed": False, "wrong_touches": 3, "time_s": 20.0}
     (row,) = palette.summarise([base, other | {"timeout": True, "missed": 2, "place_error_mm": 3.0}])

@@ -11,7 +11,8 @@ from seal_gym.sim.arm import ArmBatch
 from seal_gym.sim.look import Look, LookCfg
 from seal_gym.sim.palette_scene import BOARD_TOP_M, RGB, build_palette
 from seal_gym.sim.rgbd import DepthNoiseCfg, RgbdCamera, exposure
-from seal_gym.vision.palette_threshold import Regions, deproject, observe, targets_of
+from seal_gym.vision.palette_seen import Regions, deproject, targets_of
+from seal_gym.vision.palette_threshold import observe
 from seal_gym.workpieces.palette import draw_layout
 
 CAMERA = PaletteCfg().camera

@@ -8,7 +8,8 @@ from seal_gym.core.cell import OverheadCfg
 from seal_gym.core.errors import ConfigError
 from seal_gym.vision import hopfield, palette_segments
 from seal_gym.vision.palette_observer import PaletteObserverCfg, name_pixels, observe, verdicts
-from seal_gym.vision.palette_regions import Fault, PalettePlan, RegionCfg, back_project, depth_at
+from seal_gym.vision.palette_regions import Fault, PalettePlan, RegionCfg, depth_at
+from seal_gym.vision.palette_seen import deproject
 from seal_gym.vision.palette_segments import AreaCfg, PaletteClass
 
 WIDTH, HEIGHT, DEPTH = 320, 240, 0.6
@@ -207,7 +208,7 @@ def test_depth_of_few_pixels_is_their_median_and_of_none_is_unknown():
 
 
 def test_a_point_projects_back_to_itself():
-    np.testing.assert_allclose(back_project(np.array([100.0, 40.0]), 0.55, CAMERA), world(100, 40, 0.55))
+    np.testing.assert_allclose(deproject(np.array([100.0, 40.0]), 0.55, CAMERA), world(100, 40, 0.55))
 
 
 def test_outside_the_palette_nothing_is_seen():
