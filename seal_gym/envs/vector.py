@@ -10,7 +10,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from seal_gym.core.errors import SealGymError, require
+from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.core.frames import Array
 from seal_gym.envs.adapters import LeafFunction
 from seal_gym.envs.config import SealCfg, check_num_envs
