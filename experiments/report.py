@@ -100,6 +100,31 @@ ABOUT = {
         "Inverse kinematics",
         "How often and how fast closed form and Newton's method find a posture for a pose.",
     ),
+    "palette": (
+        "Ties pressed home on random palettes",
+        "Palettes",
+        "A scripted policy on the palette task, told the targets by the truth or by an observer of one picture.",
+    ),
+    "palette_paths": (
+        "Ways over palettes",
+        "Palette ways",
+        "Multi-path planning beside straight lines, up-across-down and RRT-Connect, among pegs.",
+    ),
+    "observer": (
+        "Observers of palettes",
+        "Observers",
+        "The two-layer Hopfield observer beside thresholds and nearest neighbours in changing light and noise.",
+    ),
+    "laydown_grid": (
+        "Grid study of the reference simulation",
+        "Grid study",
+        "One straight bead in OpenFOAM by cell size, solver and inlet.",
+    ),
+    "laydown_runs": (
+        "Reference simulations of beads",
+        "Laydown",
+        "Random paths around 25 centre paths and 12 unseen ones, simulated with OpenFOAM: the surrogate's data.",
+    ),
     "tune_edges": (
         "Settings of the edge methods",
         "Edge settings",
