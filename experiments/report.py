@@ -100,20 +100,20 @@ ABOUT = {
         "Inverse kinematics",
         "How often and how fast closed form and Newton's method find a posture for a pose.",
     ),
-    "palette": (
-        "Ties pressed home on random palettes",
-        "Palettes",
-        "A scripted policy on the palette task, told the targets by the truth or by an observer of one picture.",
-    ),
     "palette_paths": (
         "Ways over palettes",
         "Palette ways",
         "Multi-path planning beside straight lines, up-across-down and RRT-Connect, among pegs.",
     ),
+    "palette": (
+        "Ties pressed home on random palettes",
+        "Palettes",
+        "A scripted policy that is told the targets by the truth or by an observer of one picture.",
+    ),
     "observer": (
         "Observers of palettes",
         "Observers",
-        "The two-layer Hopfield observer beside thresholds and nearest neighbours in changing light and noise.",
+        "The two-layer Hopfield observer beside thresholds and k-NN in changing light and noise.",
     ),
     "laydown_grid": (
         "Grid study of the reference simulation",
@@ -123,7 +123,7 @@ ABOUT = {
     "laydown_runs": (
         "Reference simulations of beads",
         "Laydown",
-        "Random paths around 25 centre paths and 12 unseen ones, simulated with OpenFOAM: the surrogate's data.",
+        "Random paths around 25 centre paths and 12 unseen ones in OpenFOAM: the surrogate's data.",
     ),
     "tune_edges": (
         "Settings of the edge methods",
