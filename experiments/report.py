@@ -330,7 +330,8 @@ def _section(
 ) -> Section:
     name = _kind(document["name"])
     title, short, about = ABOUT.get(name, (name, name, ""))
-    if document.get("renderer") == "none":
+    seals = any("rmse_mm" in row for row in document["rows"])
+    if seals and document.get("renderer") == "none":
         about += " Features from the true geometry (oracle), without images."
     where = path.parent.as_posix()
     if where != ".":
