@@ -1,0 +1,176 @@
+"""The fast tier's cross-section: what a fan leaves in its own plane, from one station's inputs alone.
+
+The sheet stands in the tip's xz plane and moves with the tip: whatever the jet's speed, fluid comes down in
+that plane, where its ray meets the surface. The fan's flow is even over its angle, so that a strip of the
+surface between two rays gets its share of the flow, spread over the area that the strip is swept across: seen
+along the nozzle, a column's thickness is flow share / (column width times the sheet's speed across itself).
+The sealant stays where it lands. What a simulation adds to this is what a surrogate has to learn.
+"""
+
+import math
+
+import numpy as np
+
+from seal_gym.core.errors import ConfigError, is_number, require
+from seal_gym.core.frames import Array
+from seal_gym.sealant.laydown.config import THESIS_FLOW_M3S
+from seal_gym.sealant.laydown.sections import BELOW_M, PIXEL_M, RAYS, ROWS
+
+FAN_ANGLE_RAD = math.radians(40.0)
+_MIDDLE = RAYS // 2
+_RAYS_X = (np.arange(RAYS) - _MIDDLE) * PIXEL_M
+_COLUMNS_X = 0.5 * (_RAYS_X[1:] + _RAYS_X[:-1])
+_LOWER = np.arange(ROWS) * PIXEL_M
+# Where the tip turns about a point of the sheet, the sheet stands still there: a fluid would flow away.
+_SLOWEST_MPS = 0.05
+
+
+def check(name: str, values: Array, columns: int, rows: int | None = None) -> Array:
+    """Refuses an input that cannot be one of a station's.
+
+    Args:
+        name: Named in the error.
+        values: What is checked.
+        columns: How many there must be.
+        rows: Likewise; any number by default.
+
+    Returns:
+        The values as floats, shape (n, columns).
+
+    Raises:
+        ConfigError: If the shape is another or a value is not finite.
+    """
+    array = np.asarray(values, dtype=float)
+    wanted = f"({'n' if rows is None else rows}, {columns})"
+    fits = array.ndim == 2 and array.shape[1] == columns and rows in (None, len(array))
+    require(fits, f"{name} has shape {array.shape}: must be {wanted}", ConfigError)
+    require(bool(np.isfinite(array).all()), f"{name}: must be finite", ConfigError)
+    return array
+
+
+def surface_m(heights_m: Array) -> Array:
+    """The substrate in the window of a cross-section.
+
+    Args:
+        heights_m: Along 41 rays, shape (n, 41) [m].
+
+    Returns:
+        Its height over the window's lower edge in the middle of each column, shape (n, 40) [m].
+    """
+    middle = 0.5 * (heights_m[:, 1:] + heights_m[:, :-1])
+    return np.asarray(heights_m[:, _MIDDLE, None] - middle + BELOW_M)
+
+
+def filled(tops_m: Array) -> Array:
+    """How much of each pixel is below a height.
+
+    Args:
+        tops_m: Over the window's lower edge, column by column, shape (n, 40) [m].
+
+    Returns:
+        Shares in [0, 1], shape (n, 20, 40), rows up.
+    """
+    return np.asarray(np.clip((tops_m[:, None] - _LOWER[:, None]) / PIXEL_M, 0.0, 1.0))
+
+
+def sweep_mps(linear_mps: Array, angular_radps: Array, x_m: Array, heights_m: Array) -> Array:
+    """How fast the sheet moves across itself, where it meets the surface.
+
+    Args:
+        linear_mps: Of the tip, in its frame, shape (n, 3) [m/s].
+        angular_radps: Likewise, shape (n, 3) [rad/s].
+        x_m: Places across, shape (k,) [m].
+        heights_m: How far below the tip's x axis the surface is there, shape (n, k) [m].
+
+    Returns:
+        The y component of v + omega x r, shape (n, k) [m/s].
+    """
+    turn = angular_radps[:, 2:3] * x_m + angular_radps[:, 0:1] * heights_m
+    return np.asarray(linear_mps[:, 1:2] + turn)
+
+
+def ideal_area_m2(
+    linear_mps: Array, angular_radps: Array, heights_m: Array, flow_m3s: float = THESIS_FLOW_M3S
+) -> Array:
+    """Flow over speed: what a cut in the fan's plane must hold where nothing flows along the bead.
+
+    Args:
+        linear_mps: Of the tip, in its frame, shape (n, 3) [m/s].
+        angular_radps: Likewise, shape (n, 3) [rad/s].
+        heights_m: Along 41 rays, shape (n, 41) [m].
+        flow_m3s: Of sealant [m3/s].
+
+    Returns:
+        With the speed where the nozzle points at, shape (n,) [m2].
+    """
+    speed = sweep_mps(linear_mps, angular_radps, np.zeros(1), heights_m[:, _MIDDLE : _MIDDLE + 1])[:, 0]
+    return np.asarray(flow_m3s / np.maximum(np.abs(speed), _SLOWEST_MPS))
+
+
+def thickness_m(
+    linear_mps: Array,
+    angular_radps: Array,
+    heights_m: Array,
+    flow_m3s: float = THESIS_FLOW_M3S,
+    fan_angle_rad: float = FAN_ANGLE_RAD,
+) -> Array:
+    """What lands in each column of the window.
+
+    Args:
+        linear_mps: Of the tip, in its frame, shape (n, 3) [m/s].
+        angular_radps: Likewise, shape (n, 3) [rad/s].
+        heights_m: Along -z from points 1 mm apart on the tip's x axis to the surface, shape (n, 41) [m].
+        flow_m3s: Of sealant [m3/s].
+        fan_angle_rad: Over which the flow is even [rad].
+
+    Returns:
+        Thickness along the nozzle, shape (n, 40) [m]. Its sum times 1 mm is flow / speed, if the tip does not
+        turn and the fan ends within the window.
+
+    Raises:
+        ConfigError: If a shape or a number is out of range.
+    """
+    heights = check("heights_m", heights_m, RAYS)
+    linear = check("linear_mps", linear_mps, 3, len(heights))
+    angular = check("angular_radps", angular_radps, 3, len(heights))
+    require(bool((heights > 0).all()), f"heights_m: smallest {heights.min():g}: must be positive")
+    require(is_number(flow_m3s) and flow_m3s >= 0, f"flow_m3s = {flow_m3s!r}: must be a number >= 0")
+    require(
+        is_number(fan_angle_rad) and 0.01 <= fan_angle_rad <= 2.8,
+        f"fan_angle_rad = {fan_angle_rad!r}: must be in [0.01, 2.8] rad; check the unit",
+    )
+    seen = np.arctan2(_RAYS_X, heights)
+    # from the middle outwards, nothing lands behind what is in the way: the angles may only grow
+    right = np.maximum.accumulate(seen[:, _MIDDLE:], 1)
+    left = np.minimum.accumulate(seen[:, _MIDDLE::-1], 1)[:, ::-1]
+    edges = np.concatenate((left[:, :-1], right), 1).clip(-0.5 * fan_angle_rad, 0.5 * fan_angle_rad)
+    share = np.diff(edges, axis=1) / fan_angle_rad
+    speed = sweep_mps(linear, angular, _COLUMNS_X, 0.5 * (heights[:, 1:] + heights[:, :-1]))
+    return np.asarray(flow_m3s * share / (PIXEL_M * np.maximum(np.abs(speed), _SLOWEST_MPS)))
+
+
+def fan_sections(
+    linear_mps: Array,
+    angular_radps: Array,
+    heights_m: Array,
+    flow_m3s: float = THESIS_FLOW_M3S,
+    fan_angle_rad: float = FAN_ANGLE_RAD,
+) -> Array:
+    """The fast tier's cross-sections: what lands, piled up on the surface.
+
+    Args:
+        linear_mps: Of the tip, in its frame, shape (n, 3) [m/s].
+        angular_radps: Likewise, shape (n, 3) [rad/s].
+        heights_m: Along 41 rays, as ``laydown.sections.Stations`` has them, shape (n, 41) [m].
+        flow_m3s: Of sealant [m3/s].
+        fan_angle_rad: Over which the flow is even [rad].
+
+    Returns:
+        Shares of sealant in [0, 1], shape (n, 20, 40), as ``laydown.sections.cut`` gives them.
+
+    Raises:
+        ConfigError: If a shape or a number is out of range.
+    """
+    thick = thickness_m(linear_mps, angular_radps, heights_m, flow_m3s, fan_angle_rad)
+    foot = surface_m(np.asarray(heights_m, dtype=float))
+    return filled(foot + thick) - filled(foot)
