@@ -19,7 +19,7 @@ OBSTACLE_COURSE = tuple(p.name for p in VALIDATION)
 _HELD_OUT = 5  # one centre path in so many
 _SPLIT_SEED = 0  # one split for every model and training seed
 _TRIES, _PAUSE_S = 5, 1.0
-_INPUTS = ("arc_m", "linear_mps", "angular_radps", "gravity_mps2", "heights_m", "image")
+_ARRAYS = ("arc_m", "linear_mps", "angular_radps", "gravity_mps2", "heights_m", "image")
 
 
 class SurrogateDataError(SealGymError, ValueError):
@@ -71,7 +71,7 @@ def _read(path: Path) -> dict[str, Any]:
     for tries in range(_TRIES):
         try:
             with np.load(path, allow_pickle=False) as data:
-                return {k: data[k] for k in ("draw", *_INPUTS)}
+                return {k: data[k] for k in ("draw", *_ARRAYS)}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             if tries + 1 == _TRIES:
                 raise SurrogateDataError(
@@ -101,9 +101,8 @@ def read_beads(folder: Path) -> list[Bead]:
         data = _read(file)
         for draw in np.unique(data["draw"]):
             chosen = data["draw"] == draw
-            arcs, *rest, image = (data[k][chosen] for k in _INPUTS)
-            arrays = [a.astype(float) for a in (arcs, *rest)]
-            beads.append(Bead(name, int(draw), *arrays, image.astype(float) / 255.0))
+            arcs, linear, angular, gravity, heights, image = (data[k][chosen].astype(float) for k in _ARRAYS)
+            beads.append(Bead(name, int(draw), arcs, linear, angular, gravity, heights, image / 255.0))
     if not beads:
         raise SurrogateDataError(
             f"{folder} holds no data: make them with `python -m experiments.laydown runs --out {folder}`"

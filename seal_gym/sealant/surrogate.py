@@ -4,7 +4,7 @@ Paper B 3.2: at a station of the path the tip's linear and angular velocity, gra
 substrate, all in the tip's frame, tell what the bead looks like in a window of 40 x 20 pixels of 1 mm.
 ``load_surrogate`` reads weights that ``agents.train_surrogate`` wrote; ``Surrogate.predict`` uses them.
 
-Features and ``fan_section.fan_sections`` need numpy alone, models torch and safetensors.
+Features and the fast tier (``Features.fan``) need no weights; models need torch and safetensors.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ import numpy as np
 
 from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.core.frames import Array
-from seal_gym.sealant.fan_section import check, fan_sections, filled, surface_m
+from seal_gym.sealant.fan_section import SLAB_M, check, filled, surface_m, swept_thickness_m
 from seal_gym.sealant.laydown.sections import RAYS
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ KINDS = ("linear", "mlp_cnn")
 FORMAT, VERSION = "seal_gym surrogate", 1
 SPACING_M = 10e-3  # between neighbours, paper B 3.2.3
 KINEMATIC = 9
+PLANES_M = tuple(k * SLAB_M for k in (-2.0, -1.0, 0.0, 1.0, 2.0))
+_WINDOW = PLANES_M.index(0.0)
 _MOST_NEIGHBOURS = 8
 _LONGEST_FILE = 64 * 2**20
 # Seen in a mirror at x = 0: a velocity is a vector, an angular velocity a pseudovector.
@@ -69,8 +71,8 @@ class SurrogateCfg:
     Attributes:
         kind: ``"linear"``: the glass box y = W x + b; ``"mlp_cnn"``: backbones, merge, convolutions.
         neighbours: N_m, stations before and after that it is told of as well, half of them each, 10 mm apart.
-        on_fan: Whether it predicts what to add to the fast tier's section, which it then sees beside the
-            substrate.
+        on_fan: Whether it predicts what to add to the fast tier's section. It then sees the substrate in the
+            window and what the fast tier lays there, 4 and 8 mm before and behind.
         hidden: Width of the fully connected layers.
         channels: Of the convolutions.
     """
@@ -105,14 +107,14 @@ class Features:
         kinematic: Linear, angular velocity and gravity of the station and its neighbours, then for each
             neighbour whether the path goes on so far: shape (n, 9 (N + 1) + N).
         spatial: Heights of the station and its neighbours, shape (n, 41 (N + 1)) [m].
-        fan: The fast tier's sections, shape (n, 20, 40).
-        free: Share of each pixel above the substrate, shape (n, 20, 40).
+        surface: Of the substrate over the window's lower edge, column by column, shape (n, 40) [m].
+        laid: What the fast tier lays in the planes ``PLANES_M`` around the window's, shape (n, 5, 40) [m].
     """
 
     kinematic: Array
     spatial: Array
-    fan: Array
-    free: Array
+    surface: Array
+    laid: Array
 
     def __len__(self) -> int:
         """The number of sections."""
@@ -128,6 +130,14 @@ class Features:
             Their features.
         """
         return Features(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def fan(self) -> Array:
+        """The fast tier's sections.
+
+        Returns:
+            Shares of sealant in [0, 1], shape (n, 20, 40).
+        """
+        return filled(self.surface + self.laid[:, _WINDOW]) - filled(self.surface)
 
     def flat(self) -> Array:
         """The input vector x of the linear model.
@@ -146,7 +156,7 @@ class Features:
         places = self.spatial.shape[1] // RAYS
         signs = np.append(np.tile(_MIRROR, places), np.ones(places - 1))
         heights = self.spatial.reshape(-1, places, RAYS)[:, :, ::-1].reshape(self.spatial.shape)
-        return Features(self.kinematic * signs, heights, self.fan[..., ::-1], self.free[..., ::-1])
+        return Features(self.kinematic * signs, heights, self.surface[:, ::-1], self.laid[..., ::-1])
 
 
 def joined(parts: list[Features]) -> Features:
@@ -172,12 +182,12 @@ def features(at: StationsLike, neighbours: int = 0) -> Features:
         The features of each station.
 
     Raises:
-        ConfigError: If shapes do not fit, a number is not finite or the arc lengths do not rise.
+        ConfigError: If shapes do not fit, a number is not finite or the arc lengths do not rise, or there are
+            fewer than two stations.
     """
     heights = check("heights_m", at.heights_m, RAYS)
     n = len(heights)
     arcs = check("arcs_m", np.asarray(at.arcs_m)[:, None], 1, n)[:, 0]
-    require(n > 0 and bool((np.diff(arcs) > 0).all()), "arcs_m: must rise from station to station")
     names = ("linear_mps", "angular_radps", "gravity_mps2")
     linear, angular, gravity = (check(name, getattr(at, name), 3, n) for name in names)
     own = np.concatenate((linear, angular, gravity), 1)
@@ -189,8 +199,8 @@ def features(at: StationsLike, neighbours: int = 0) -> Features:
     there = [((row > arcs[0] - slack) & (row < arcs[-1] + slack)).astype(float) for row in wanted]
     kinematic = np.concatenate([own, *(own[i] for i in index), *(t[:, None] for t in there)], 1)
     spatial = np.concatenate([heights, *(heights[i] for i in index)], 1)
-    fan = fan_sections(linear, angular, heights)
-    return Features(kinematic, spatial, fan, 1.0 - filled(surface_m(heights)))
+    laid = swept_thickness_m(arcs, linear, angular, heights, PLANES_M)
+    return Features(kinematic, spatial, surface_m(heights), laid)
 
 
 class Surrogate:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from seal_gym.core.frames import Array
-from seal_gym.sealant.laydown.sections import COLUMNS, RAYS, ROWS
-from seal_gym.sealant.surrogate import KINEMATIC, Features, SurrogateCfg
+from seal_gym.sealant.laydown.sections import COLUMNS, PIXEL_M, RAYS, ROWS
+from seal_gym.sealant.surrogate import KINEMATIC, PLANES_M, Features, SurrogateCfg
 
 _SEED_ROWS, _SEED_COLUMNS = ROWS // 4, COLUMNS // 4  # what the merged features are unflattened to
 _BATCH = 64
@@ -127,11 +127,12 @@ class SectionNet(nn.Module):
         self.merge = mlp(wide // 2 + wide, 2 * wide, c * _SEED_ROWS * _SEED_COLUMNS)
         self.coarse = nn.Sequential(Residual(c, c), SqueezeExcitation(c))
         self.middle = nn.Sequential(Residual(c, c), SqueezeExcitation(c))
-        self.fine = nn.Sequential(Residual(c + (2 if cfg.on_fan else 0), c), SqueezeExcitation(c))
+        self.fine = nn.Sequential(
+            Residual(c + (1 + len(PLANES_M) if cfg.on_fan else 0), c), SqueezeExcitation(c)
+        )
         self.last = nn.Conv2d(c, 1, 3, padding=1)
         if cfg.on_fan:  # begins as the fast tier
-            nn.init.zeros_(self.last.weight)
-            nn.init.zeros_(self.last.bias)
+            self.last.load_state_dict({k: torch.zeros_like(v) for k, v in self.last.state_dict().items()})
         self.larger = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
 
     def normalise(self, inputs: Features) -> None:
@@ -147,18 +148,21 @@ class SectionNet(nn.Module):
             getattr(self, f"{name}_mean").copy_(torch.from_numpy(values.mean(0)))
             getattr(self, f"{name}_scale").copy_(torch.from_numpy(scale))
 
-    def forward(self, kinematic: Tensor, spatial: Tensor, fan: Tensor, free: Tensor) -> Tensor:
+    def forward(self, kinematic: Tensor, spatial: Tensor, surface: Tensor, laid: Tensor) -> Tensor:
         """Sections, not clipped.
 
         Args:
             kinematic: See ``Features``, shape (n, k).
             spatial: Shape (n, s).
-            fan: Shape (n, 20, 40).
-            free: Shape (n, 20, 40).
+            surface: Shape (n, 40) [m].
+            laid: Shape (n, 5, 40) [m].
 
         Returns:
             Shape (n, 20, 40). On the fast tier, nothing is where the substrate is.
         """
+        ground = _filled(surface[:, None])
+        around = _filled(surface[:, None] + laid) - ground
+        fan, free = around[:, len(PLANES_M) // 2], 1.0 - ground[:, 0]
         moving = (kinematic - self.kinematic_mean) / self.kinematic_scale
         below = (spatial - self.spatial_mean) / self.spatial_scale
         if self.cfg.kind == "linear":
@@ -166,14 +170,20 @@ class SectionNet(nn.Module):
             whole: Tensor = free * (fan + plain)
             return whole if self.cfg.on_fan else plain
         merged = self.merge(torch.cat((self.of_motion(moving), self.of_surface(below)), 1))
-        seed = self.coarse(merged.view(-1, self.cfg.channels, _SEED_ROWS, _SEED_COLUMNS))
-        image = self.larger(self.middle(self.larger(seed)))
+        image = merged.view(-1, self.cfg.channels, _SEED_ROWS, _SEED_COLUMNS)
+        image = self.larger(self.coarse(self._beside(image, around, ground)))
+        image = self.larger(self.middle(self._beside(image, around, ground)))
+        last: Tensor = self.last(self.fine(self._beside(image, around, ground)))[:, 0]
+        corrected: Tensor = free * (fan + last)
+        return corrected if self.cfg.on_fan else last
+
+    def _beside(self, image: Tensor, around: Tensor, ground: Tensor) -> Tensor:
+        """On the fast tier, what it lays and the substrate join the channels, in the image's resolution."""
         if not self.cfg.on_fan:
-            alone: Tensor = self.last(self.fine(image))[:, 0]
-            return alone
-        change = self.last(self.fine(torch.cat((image, fan[:, None], free[:, None]), 1)))[:, 0]
-        corrected: Tensor = free * (fan + change)
-        return corrected
+            return image
+        known = torch.cat((around, ground), 1)
+        pooled = nn.functional.avg_pool2d(known, known.shape[-1] // image.shape[-1])
+        return torch.cat((image, pooled), 1)
 
     def run(self, inputs: Features) -> Array:
         """Sections of features, on one thread.
@@ -196,9 +206,9 @@ class SectionNet(nn.Module):
         """The weights.
 
         Returns:
-            Arrays by name.
+            Copies by name.
         """
-        return {k: np.ascontiguousarray(v.detach().numpy()) for k, v in self.state_dict().items()}
+        return {k: v.detach().numpy().copy() for k, v in self.state_dict().items()}
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Sets the weights.
@@ -222,13 +232,19 @@ def tensors(inputs: Features) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         inputs: Of n sections.
 
     Returns:
-        Kinematic, spatial, fan, free, of single precision.
+        Kinematic, spatial, surface, laid, of single precision.
     """
-    k, s, fan, free = (
+    one, two, three, four = (
         torch.from_numpy(np.ascontiguousarray(v, dtype=np.float32))
-        for v in (inputs.kinematic, inputs.spatial, inputs.fan, inputs.free)
+        for v in (inputs.kinematic, inputs.spatial, inputs.surface, inputs.laid)
     )
-    return k, s, fan, free
+    return one, two, three, four
+
+
+def _filled(tops_m: Tensor) -> Tensor:
+    """``fan_section.filled`` for tops (n, m, 40): shares (n, m, 20, 40)."""
+    lower = torch.arange(ROWS, dtype=tops_m.dtype)[:, None]
+    return (tops_m[:, :, None] / PIXEL_M - lower).clamp(0.0, 1.0)
 
 
 @contextmanager
