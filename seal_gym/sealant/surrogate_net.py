@@ -125,10 +125,9 @@ class SectionNet(nn.Module):
         self.of_motion = mlp(kinematic, wide, wide // 2)
         self.of_surface = mlp(spatial, wide, wide)
         self.merge = mlp(wide // 2 + wide, 2 * wide, c * _SEED_ROWS * _SEED_COLUMNS)
-        self.coarse = nn.Sequential(Residual(c, c), SqueezeExcitation(c))
-        self.middle = nn.Sequential(Residual(c, c), SqueezeExcitation(c))
-        self.fine = nn.Sequential(
-            Residual(c + (1 + len(PLANES_M) if cfg.on_fan else 0), c), SqueezeExcitation(c)
+        seen = c + (1 + len(PLANES_M) if cfg.on_fan else 0)
+        self.coarse, self.middle, self.fine = (
+            nn.Sequential(Residual(seen, c), SqueezeExcitation(c)) for _ in range(3)
         )
         self.last = nn.Conv2d(c, 1, 3, padding=1)
         if cfg.on_fan:  # begins as the fast tier
