@@ -22,6 +22,7 @@ import agents
 from agents.surrogate_data import Bead, digest, read_beads, split
 from experiments import command, results, surrogate_figures
 from experiments import surrogate_ladder as ladder
+from experiments import surrogate_metrics as metrics
 from experiments.surrogate_ladder import Judged
 from seal_gym.core.errors import require
 from seal_gym.sealant.laydown import sections
@@ -40,6 +41,8 @@ _WORDS = {
     "g_y": "gravity ahead",
     "g_z": "gravity back along the nozzle",
 }
+
+_EFFECTS = ("area_mm2", "right_mm", "up_mm", "height_mm", "slope_deg")
 
 Row = dict[str, Any]
 
@@ -93,7 +96,8 @@ def words(rows: list[Row]) -> str:
     def said(row: Row) -> str:
         return (
             f"area {row['area_mm2']:+.1f} mm², shifted {row['right_mm']:+.2f} mm to the right and "
-            f"{row['up_mm']:+.2f} mm up, thickest column {row['height_mm']:+.2f} mm"
+            f"{row['up_mm']:+.2f} mm up, sloping {row['slope_deg']:+.1f} deg up to the right, "
+            f"thickest column {row['height_mm']:+.2f} mm"
         )
 
     lines = [
@@ -104,7 +108,7 @@ def words(rows: list[Row]) -> str:
     heights = [r for r in rows if r["input"] not in _WORDS]
     left, right = heights[: len(heights) // 2], heights[len(heights) // 2 + 1 :]
     for title, chosen in (("everywhere", heights), ("left of the nozzle", left), ("right of it", right)):
-        total = {k: sum(r[k] for r in chosen) for k in ("area_mm2", "right_mm", "up_mm", "height_mm")}
+        total = {k: sum(r[k] for r in chosen) for k in _EFFECTS}
         sd = 1e3 * float(np.mean([r["one_sd"] for r in chosen]))
         lines.append(f"- heights {title} (+{sd:.1f} mm, one deviation each): {said(total)}.")
     return "\n".join(lines)
@@ -155,7 +159,7 @@ def text(found: list[Judged], compared: list[Row], glass: list[Row], data: Row) 
 def examples(
     found: dict[str, Judged], names: list[str], beads: list[Bead]
 ) -> list[tuple[str, list[np.ndarray[Any, Any]]]]:
-    """Sections to show: the middle ones of beads spread over the course, and the worst.
+    """Sections to show: the middle one of a bead around each centre path, and the worst.
 
     Args:
         found: Judged models by name.
@@ -172,8 +176,10 @@ def examples(
         k = next(k for k, b in enumerate(beads) if b.path == place)
         chosen.append((k, len(beads[k].images) // 2, ""))
     overlap = [sections.iou(i, b.images) for i, b in zip(best.images, beads, strict=True)]
-    k = min(range(len(beads)), key=lambda k: float(overlap[k].min()))
-    chosen.append((k, int(overlap[k].argmin()), "worst: "))
+    inner = [np.where(metrics.inner(b), o, 1.0) for o, b in zip(overlap, beads, strict=True)]
+    for mark, values in (("worst: ", overlap), ("worst but for ends: ", inner)):
+        k = min(range(len(beads)), key=lambda k: float(values[k].min()))
+        chosen.append((k, int(values[k].argmin()), mark))
     out = []
     for k, row, mark in chosen:
         title = f"{mark}{beads[k].path.replace('_', ' ')}, {1e3 * beads[k].arcs_m[row]:.0f} mm"

@@ -17,11 +17,12 @@ import matplotlib.pyplot as plt  # the backend has to be chosen first
 _MM = 1e3 * PIXEL_M
 _EXTENT = (-COLUMNS / 2 * _MM, COLUMNS / 2 * _MM, -1e3 * BELOW_M, ROWS * _MM - 1e3 * BELOW_M)
 _FIXED = ("reference itself", "mean section", "fast tier, one station", "fast tier, along the path")
-# rays shown: left, middle, right
-_SHOWN = {f"v{a}": k for k, a in enumerate(("$_x$", "$_y$", "$_z$"))}
-_SHOWN |= {rf"$\omega_{a}$": 3 + k for k, a in enumerate("xyz")}
-_SHOWN |= {f"$g_{a}$": 6 + k for k, a in enumerate("xyz")}
-_SHOWN |= {"height 10 mm left": 9 + 10, "height below the nozzle": 9 + 20, "height 10 mm right": 9 + 30}
+# inputs shown, from the first of a row to the last
+_SHOWN = {f"$v_{a}$": slice(k, k + 1) for k, a in enumerate("xyz")}
+_SHOWN |= {rf"$\omega_{a}$": slice(3 + k, 4 + k) for k, a in enumerate("xyz")}
+_SHOWN |= {f"$g_{a}$": slice(6 + k, 7 + k) for k, a in enumerate("xyz")}
+_SHOWN |= {"heights left of the nozzle": slice(9, 29), "all heights": slice(9, 50)}
+_SHOWN |= {"heights right of the nozzle": slice(30, 50)}
 
 
 def ladder(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -70,11 +71,10 @@ def glass_box(path: Path, model: Surrogate) -> None:
     first.set_title("b: section at mean inputs (black: full)", fontsize=9)
     for _ in range(2):
         next(spots).set_axis_off()
-    bound = float(np.abs(weights[list(_SHOWN.values())]).max())
-    for (name, k), spot in zip(_SHOWN.items(), spots, strict=True):
-        picture = spot.imshow(
-            weights[k], origin="lower", extent=_EXTENT, cmap="RdBu_r", vmin=-bound, vmax=bound
-        )
+    maps = {name: weights[chosen].sum(0) for name, chosen in _SHOWN.items()}
+    bound = max(float(np.abs(m).max()) for m in maps.values())
+    for (name, change), spot in zip(maps.items(), spots, strict=True):
+        picture = spot.imshow(change, origin="lower", extent=_EXTENT, cmap="RdBu_r", vmin=-bound, vmax=bound)
         spot.set_title(f"{name}, + one deviation", fontsize=9)
     for spot in axes[-1]:
         spot.set_xlabel("across [mm]")
@@ -115,7 +115,9 @@ def examples(path: Path, rows: Sequence[tuple[str, Sequence[Array]]], names: Seq
                     colors="#d1382c",
                     linewidths=1,
                 )
-        line[0].set_ylabel(title.replace(", ", "\n").replace(": ", ":\n"), fontsize=9)
+        line[0].set_ylabel(
+            title.replace(", ", "\n").replace(": ", ":\n").replace("but for", "but\nfor"), fontsize=9
+        )
     for spot, name in zip(axes[0], names, strict=True):
         spot.set_title(name, fontsize=10)
     for spot in axes[-1]:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours
 
@@ -50,6 +51,18 @@ def contour_distance_m(one: Array, two: Array) -> float | None:
     return float(0.5 * (there + back)) * sections.PIXEL_M
 
 
+def inner(bead: Bead) -> NDArray[np.bool_]:
+    """Which sections are not near an end of the bead.
+
+    Args:
+        bead: The bead.
+
+    Returns:
+        Those at least 10 mm along the tip's path from both ends, shape (n,).
+    """
+    return np.asarray((bead.arcs_m >= END_M) & (bead.arcs_m <= bead.arcs_m[-1] - END_M))
+
+
 def scores(images: Array, bead: Bead) -> Row:
     """How well one bead is predicted.
 
@@ -63,7 +76,7 @@ def scores(images: Array, bead: Bead) -> Row:
     """
     area, true = sections.area_m2(images), sections.area_m2(bead.images)
     ideal = fan_section.ideal_area_m2(bead.linear_mps, bead.angular_radps, bead.heights_m)
-    inner = (bead.arcs_m >= END_M) & (bead.arcs_m <= bead.arcs_m[-1] - END_M)
+    away = inner(bead)
     lines = [contour_distance_m(a, b) for a, b in zip(images, bead.images, strict=True)]
     known = [line for line in lines if line is not None]
     width, height = sections.width_m, sections.height_m
@@ -74,8 +87,8 @@ def scores(images: Array, bead: Bead) -> Row:
         "mse": float(np.mean((images - bead.images) ** 2)),
         "iou": float(sections.iou(images, bead.images).mean()),
         "area_error_pct": 100.0 * float(np.abs(area - true).mean() / true.mean()),
-        "ideal_error_pct": 100.0 * float(np.abs(area - ideal)[inner].mean() / ideal[inner].mean())
-        if inner.any()
+        "ideal_error_pct": 100.0 * float(np.abs(area - ideal)[away].mean() / ideal[away].mean())
+        if away.any()
         else None,
         "width_error_mm": _MM * float(np.abs(width(images) - width(bead.images)).mean()),
         "height_error_mm": _MM * float(np.abs(height(images) - height(bead.images)).mean()),
@@ -124,13 +137,16 @@ def effects(weights: Array, mean: Array) -> list[Row]:
         mean: The section at mean inputs, shape (20, 40).
 
     Returns:
-        Changes of the area [mm2], of its centroid to the right and up [mm], and of the thickest column [mm].
+        Changes of the area [mm2], of its centroid to the right and up [mm], of the thickest column [mm], and
+        of the bead's slope, up to the right [deg].
     """
     x = (np.arange(sections.COLUMNS) + 0.5) * sections.PIXEL_M
     z = (np.arange(sections.ROWS) + 0.5) * sections.PIXEL_M
     area = mean.sum()
     centre = np.array([(mean.sum(0) * x).sum(), (mean.sum(1) * z).sum()]) / area
     thick = int(mean.sum(0).argmax())
+    lever = (z - centre[1])[:, None] * (x - centre[0])
+    spread = float(np.sum(mean.sum(0) * (x - centre[0]) ** 2))  # slope: the regression of z on x
     rows = []
     for w in weights:
         moved = [(w.sum(0) * (x - centre[0])).sum() / area, (w.sum(1) * (z - centre[1])).sum() / area]
@@ -140,6 +156,7 @@ def effects(weights: Array, mean: Array) -> list[Row]:
                 "right_mm": _MM * float(moved[0]),
                 "up_mm": _MM * float(moved[1]),
                 "height_mm": _MM * float(w[:, thick].sum()) * sections.PIXEL_M,
+                "slope_deg": float(np.degrees(np.sum(w * lever) / spread)),
             }
         )
     return rows

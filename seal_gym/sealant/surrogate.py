@@ -72,7 +72,7 @@ class SurrogateCfg:
         kind: ``"linear"``: the glass box y = W x + b; ``"mlp_cnn"``: backbones, merge, convolutions.
         neighbours: N_m, stations before and after that it is told of as well, half of them each, 10 mm apart.
         on_fan: Whether it predicts what to add to the fast tier's section. It then sees the substrate in the
-            window and what the fast tier lays there, 4 and 8 mm before and behind.
+            window and what the fast tier lays there, 6 and 12 mm before and behind.
         hidden: Width of the fully connected layers.
         channels: Of the convolutions.
     """

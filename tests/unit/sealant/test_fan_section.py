@@ -9,7 +9,9 @@ from seal_gym.sealant.fan_section import (
     fan_sections,
     filled,
     ideal_area_m2,
+    poses,
     surface_m,
+    swept_thickness_m,
     thickness_m,
 )
 from seal_gym.sealant.laydown import sections
@@ -141,3 +143,73 @@ def test_bad_inputs_are_refused(change, message):
     good = {"linear_mps": still(0.3), "angular_radps": NONE, "heights_m": plane(30e-3)}
     with pytest.raises(ConfigError, match=message):
         fan_sections(**(good | change))
+
+
+def swept(vx=0.0, vy=0.3, turn=0.0, n=61, height_m=30e-3):
+    arcs = 1e-3 * np.arange(n)
+    linear = np.tile([vx, vy, 0.0], (n, 1))
+    angular = np.tile([0.0, 0.0, turn], (n, 1))
+    return swept_thickness_m(arcs, linear, angular, np.full((n, 41), height_m), planes_m=(0.0, 10e-3))
+
+
+@pytest.mark.parametrize(("vx", "vy"), [(0.0, 0.3), (0.2, 0.2), (-0.3, 0.15)])
+def test_along_a_straight_path_the_swept_fan_is_the_station_s(vx, vy):
+    thick = swept(vx, vy)[30, 0]
+    alone = thickness_m(still(vy, vx), NONE, plane(30e-3))[0]
+    assert thick.sum() == pytest.approx(alone.sum(), rel=5e-3)
+    np.testing.assert_allclose(thick, alone, atol=0.02 * alone.max())
+
+
+def test_a_bead_begins_and_ends():
+    areas = swept().sum(-1) * 1e-3
+    whole = FLOW / 0.3
+    # the triangle of 6 mm to each side: half of it at the first station, all of it 6 mm on
+    assert areas[0, 0] == pytest.approx(0.5 * whole, rel=0.01)
+    assert areas[3, 0] == pytest.approx((1 - 0.5 * 0.5**2) * whole, rel=0.01)
+    assert areas[6, 0] == pytest.approx(whole, rel=0.01)
+    # the bead ends at 61 mm: the plane 10 mm ahead of the station at 57 mm is 6 mm beyond
+    assert areas[57, 1] == pytest.approx(0.0, abs=1e-12)
+    assert areas[41, 1] == pytest.approx(whole, rel=0.01)
+
+
+def test_where_the_tip_turns_the_inner_side_is_thicker():
+    # 0.3 m/s at 5 rad/s: the tip runs round a circle of 60 mm, its right side outside
+    thick = swept(turn=5.0)[30, 0]
+    x = (np.arange(40) - 19.5) * 1e-3
+    alone = thickness_m(still(0.3), np.array([[0.0, 0.0, 5.0]]), plane(30e-3))[0]
+    wet = np.abs(x) < 9e-3
+    np.testing.assert_allclose(thick[wet], alone[wet], rtol=0.03)
+
+
+def test_a_fan_that_turns_on_the_spot_lays_its_volume_round_it():
+    # half a turn of 100 steps about the nozzle: what lies in a plane through the axis comes from all of them
+    n, turn, duration = 101, 10.0, np.pi / 10.0
+    arcs = 1e-4 * np.arange(n)  # hardly moves
+    speed = arcs[-1] / duration
+    linear = np.tile([0.0, 0.0, speed], (n, 1))
+    angular = np.tile([0.0, 0.0, turn], (n, 1))
+    heights = np.full((n, 41), 30e-3)
+    thick = swept_thickness_m(arcs, linear, angular, heights)[n // 2, 0]
+    # far from the axis a radius r is swept at r turn: the two arms pass each place once in half a turn
+    x = (np.arange(40) - 19.5) * 1e-3
+    density = FLOW / FAN_ANGLE_RAD * (30e-3 / (30e-3**2 + x**2)) / (np.abs(x) * turn)
+    far = (np.abs(x) > 6e-3) & (np.abs(x) < 9e-3)
+    np.testing.assert_allclose(thick[far], density[far], rtol=0.1)
+
+
+def test_stations_stand_where_they_were_taken():
+    draws = np.random.default_rng(0).normal(
+        [30e-3, 0.3, 0.2, 0.1, 0.3], [2e-3, 0.02, 0.05, 0.05, 0.05], (4, 5)
+    )
+    cfg = LaydownCfg(path=tip_path(TRAINING[1], draws))
+    at = sections.stations(cfg)
+    dt, positions, rotations = poses(at.arcs_m, at.linear_mps, at.angular_radps)
+    true, turned, _ = cfg.path.at(at.times_s)
+    np.testing.assert_allclose(dt[:-1], np.diff(at.times_s), rtol=1e-2)
+    np.testing.assert_allclose(positions[:-1], (true - true[0]) @ turned[0], atol=2e-4)
+    np.testing.assert_allclose(rotations[:-1], turned[0].T @ turned, atol=0.02)
+
+
+def test_a_path_of_one_station_is_refused():
+    with pytest.raises(ConfigError, match="at least 2"):
+        swept(n=1)
