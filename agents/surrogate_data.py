@@ -70,7 +70,8 @@ def _read(path: Path) -> dict[str, Any]:
     """A file that another process may be replacing."""
     for tries in range(_TRIES):
         try:
-            with np.load(path, allow_pickle=False) as data:
+            # np.load leaves a file open that it opened itself and cannot read
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 return {k: data[k] for k in ("draw", *_ARRAYS)}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             if tries + 1 == _TRIES:

@@ -30,8 +30,8 @@ _COLUMNS_X = 0.5 * (_RAYS_X[1:] + _RAYS_X[:-1])
 _LOWER = np.arange(ROWS) * PIXEL_M
 # Where the tip turns about a point of the sheet, the sheet stands still there: a fluid would flow away.
 _SLOWEST_MPS = 0.05
-# Half the length over which what lands is averaged along the bead. The reference, too, cannot hold steps along
-# the bead: of 1 to 8 mm, 6 gave the largest intersection over union with it on the training paths.
+# Half the length over which what lands is averaged along the bead. The reference, too, cannot hold steps
+# along the bead: of 1 to 8 mm, 6 gave the largest intersection over union with it on the training paths.
 SLAB_M = 6e-3
 _REACH_M = 25e-3  # along the path, as far as stations are looked for that lay in a window's plane
 _PER_STATION = 2
