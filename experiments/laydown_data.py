@@ -181,7 +181,7 @@ def sample(data: Path, out: Path, draws: int) -> list[Row]:
         with np.load(file, allow_pickle=False) as all_of_it:
             kept = all_of_it["draw"] < draws
             arrays = {k: all_of_it[k][kept] for k in ("draw", *INPUTS, "image")}
-        np.savez_compressed(copy, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(copy, **arrays)
         beads = len(np.unique(arrays["draw"]))
         size = copy.stat().st_size
         rows.append({"path": centre.name, "beads": beads, "sections": int(kept.sum()), "bytes": size})
