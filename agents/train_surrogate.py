@@ -57,7 +57,7 @@ class TrainCfg:
 
     optimiser: str = "adamw"
     seed: int = 0
-    epochs: int = 40
+    epochs: int = 14
     batch: int = 64
     every: int = 2
     learning_rate: float | None = None
@@ -85,7 +85,7 @@ class TrainCfg:
     @property
     def rate(self) -> float:
         """The learning rate at the start."""
-        return self.learning_rate or {"sgd": 0.03, "adamw": 3e-3}[self.optimiser]
+        return self.learning_rate or {"sgd": 0.1, "adamw": 3e-3}[self.optimiser]
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--neighbours", type=int, default=4, help="N_m, even (default: %(default)s)")
     parser.add_argument("--on-fan", action="store_true", help="predict what to add to the fast tier")
     parser.add_argument("--optimiser", choices=OPTIMISERS, default="adamw", help="(default: %(default)s)")
-    parser.add_argument("--epochs", type=int, default=40, help="(default: %(default)s)")
+    parser.add_argument("--epochs", type=int, default=14, help="(default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default: %(default)s)")
     options = parser.parse_args(arguments)
     try:

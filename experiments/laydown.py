@@ -11,7 +11,7 @@ inlets, and compares each with the finest of its inlet. It writes laydown_grid.j
 around each, one around each before the next. It writes <centre path>.npz: what the surrogate is told and
 what it has to predict, by section; and laydown_runs.json, .csv, .md. Both go on where they were stopped.
 
-``sample`` copies the obstacle course's first ``--draws`` out of ``--data``.
+``sample`` copies the obstacle course's first ``--draws`` out of ``--data``; sample.json says what.
 """
 
 import argparse
@@ -28,6 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 from agents import engines
+from agents.provenance import commit
 from experiments import command, laydown_data, laydown_figures, results
 from seal_gym.sealant.laydown import foam, sections
 from seal_gym.sealant.laydown.config import SOLVERS, THESIS_FLOW_M3S, GridCfg, LaydownCfg, TcpPath
@@ -259,6 +260,8 @@ def sample(options: argparse.Namespace) -> str:
         The table of what was copied.
     """
     rows = laydown_data.sample(options.data, options.out, options.draws)
+    about = {"name": "laydown_sample", "command": results.command(NAME), "git_commit": commit(), "rows": rows}
+    (options.out / "sample.json").write_text(results.document_text(about), encoding="utf-8")
     return results.grid(list(rows[0]), [[str(v) for v in r.values()] for r in rows])
 
 

@@ -279,7 +279,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--save", type=Path, help=f"folder for what is trained (default: OUT; shipped: {agents.WEIGHTS.name})"
     )
-    parser.add_argument("--epochs", type=int, default=30, help="of each network (default: %(default)s)")
+    parser.add_argument("--epochs", type=int, default=14, help="of each network (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="first training seed (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=1, help="training seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")

@@ -134,7 +134,7 @@ def curves(path: Path, histories: dict[str, tuple[tuple[float, float], ...]]) ->
         path: The PNG file.
         histories: Training and held-out error of each epoch, by model.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, constrained_layout=True)
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.8), sharey=True, constrained_layout=True)
     colours = mpl.colormaps["tab10"](np.arange(len(histories)))
     for k, (name, history) in enumerate(histories.items()):
         for spot, column in zip(axes, (0, 1), strict=True):
@@ -144,6 +144,7 @@ def curves(path: Path, histories: dict[str, tuple[tuple[float, float], ...]]) ->
         spot.set(title=title, xlabel="epoch", yscale="log")
         spot.grid(color="#dddddd", lw=0.6, which="both")
     axes[0].set_ylabel("mean square error of a pixel")
-    axes[1].legend(fontsize=8, loc="upper right")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
     figure.savefig(path, dpi=110)
     plt.close(figure)

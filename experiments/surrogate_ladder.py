@@ -52,7 +52,6 @@ def _ladder() -> tuple[Rung, ...]:
         Rung("linear, N_m = 4", SurrogateCfg(kind="linear", neighbours=4)),
         Rung("MLP-CNN, SGD", net(), "sgd"),
         Rung("MLP-CNN, AdamW", net(), "adamw"),
-        Rung("MLP-CNN, N_m = 4, SGD", net(neighbours=4), "sgd"),
         Rung("MLP-CNN, N_m = 4, AdamW", net(neighbours=4), "adamw"),
         Rung("fast tier + linear", SurrogateCfg(kind="linear", on_fan=True)),
         Rung("fast tier + MLP-CNN, SGD", net(on_fan=True), "sgd"),

@@ -81,7 +81,7 @@ class SurrogateCfg:
     neighbours: int = 0
     on_fan: bool = False
     hidden: int = 64
-    channels: int = 16
+    channels: int = 12
 
     def __post_init__(self) -> None:
         """Checks the choices."""

@@ -178,7 +178,9 @@ def test_a_sample_is_the_course_s_first_draws(tmp_path):
     out = tmp_path / "course"
     command = ["sample", "--data", str(tmp_path), "--out", str(out), "--draws", "2"]
     assert experiment.main(command) == 0
-    assert [f.name for f in out.iterdir()] == ["box_side.npz"]
+    assert sorted(f.name for f in out.iterdir()) == ["box_side.npz", "sample.json"]
+    (row,) = json.loads((out / "sample.json").read_text())["rows"]
+    assert (row["path"], row["beads"], row["sections"]) == ("box_side", 2, 6)
     with np.load(out / "box_side.npz") as data:
         assert data["draw"].tolist() == [0] * 3 + [1] * 3
         assert set(data) == {"draw", "image", *laydown_data.INPUTS}
