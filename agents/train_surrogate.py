@@ -36,7 +36,7 @@ from seal_gym.sealant.surrogate import KINDS, Features, Surrogate, SurrogateCfg,
 from seal_gym.sealant.surrogate_net import SectionNet, tensors
 
 OPTIMISERS = ("sgd", "adamw")
-RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 _WARM = 3  # epochs
 _STACK = ("python", "torch", "safetensors", "numpy", "scipy")
 

@@ -42,7 +42,13 @@ _WORDS = {
     "g_z": "gravity back along the nozzle",
 }
 
-_EFFECTS = ("area_mm2", "right_mm", "up_mm", "height_mm", "slope_deg")
+_EFFECTS = {
+    "area_mm2": ("area", "mm²"),
+    "height_mm": ("thickness where it is thickest", "mm"),
+    "right_mm": ("place across, to the right,", "mm"),
+    "up_mm": ("place along the nozzle, up,", "mm"),
+    "slope_deg": ("slope, up to the right,", "deg"),
+}
 
 Row = dict[str, Any]
 
@@ -83,6 +89,29 @@ def markdown(rows: list[Row]) -> str:
     return results.grid(head, body)
 
 
+def told(rows: list[Row]) -> list[tuple[str, Row]]:
+    """The glass box's inputs as people think of them.
+
+    Args:
+        rows: From ``ladder.reading``.
+
+    Returns:
+        Name and effects of each input of motion, then of all heights, those to the left and to the right.
+    """
+    named = [
+        (f"{_WORDS[r['input']]} ({r['input']}, +{r['one_sd']:.2g} {r['unit']})", r)
+        for r in rows
+        if r["input"] in _WORDS
+    ]
+    heights = [r for r in rows if r["input"] not in _WORDS]
+    left, right = heights[: len(heights) // 2], heights[len(heights) // 2 + 1 :]
+    for title, chosen in (("all heights", heights), ("heights to the left", left), ("to the right", right)):
+        mean = 1e3 * float(np.mean([r["one_sd"] for r in chosen]))
+        total = {k: sum(r[k] for r in chosen) for k in _EFFECTS}
+        named.append((f"{title} (+{mean:.1f} mm)", total))
+    return named
+
+
 def words(rows: list[Row]) -> str:
     """The glass box's reading in words.
 
@@ -90,28 +119,16 @@ def words(rows: list[Row]) -> str:
         rows: From ``ladder.reading``.
 
     Returns:
-        A sentence for each input of motion and one for the heights.
+        What matters most to each property of the bead, and a table.
     """
-
-    def said(row: Row) -> str:
-        return (
-            f"area {row['area_mm2']:+.1f} mm², shifted {row['right_mm']:+.2f} mm to the right and "
-            f"{row['up_mm']:+.2f} mm up, sloping {row['slope_deg']:+.1f} deg up to the right, "
-            f"thickest column {row['height_mm']:+.2f} mm"
-        )
-
-    lines = [
-        f"- {_WORDS[r['input']]} ({r['input']}, +{r['one_sd']:.2g} {r['unit']}): {said(r)}."
-        for r in rows
-        if r["input"] in _WORDS
-    ]
-    heights = [r for r in rows if r["input"] not in _WORDS]
-    left, right = heights[: len(heights) // 2], heights[len(heights) // 2 + 1 :]
-    for title, chosen in (("everywhere", heights), ("left of the nozzle", left), ("right of it", right)):
-        total = {k: sum(r[k] for r in chosen) for k in _EFFECTS}
-        sd = 1e3 * float(np.mean([r["one_sd"] for r in chosen]))
-        lines.append(f"- heights {title} (+{sd:.1f} mm, one deviation each): {said(total)}.")
-    return "\n".join(lines)
+    named = told(rows)
+    lines = []
+    for key, (what, unit) in _EFFECTS.items():
+        name, row = max(named, key=lambda n: abs(n[1][key]))
+        lines.append(f"- {what} depends most on {name}: {row[key]:+.2f} {unit}.")
+    head = ["one deviation more of", *(f"{what} {unit}" for what, unit in _EFFECTS.values())]
+    body = [[name, *(f"{row[key]:+.2f}" for key in _EFFECTS)] for name, row in named]
+    return "\n".join(lines) + "\n\n" + results.grid(head, body)
 
 
 def text(found: list[Judged], compared: list[Row], glass: list[Row], data: Row) -> str:

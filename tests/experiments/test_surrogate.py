@@ -160,7 +160,10 @@ def test_the_words_name_every_motion(small):
         {"input": name, "one_sd": 0.1, "unit": "m/s", **dict.fromkeys(experiment._EFFECTS, 1.0)}
         for name in (*experiment._WORDS, *(f"h({k - 20:+d} mm)" for k in range(41)))
     ]
-    lines = experiment.words(rows).splitlines()
-    assert len(lines) == 9 + 3
-    assert "area +41.0" in lines[9]
-    assert "area +20.0" in lines[10]
+    rows[1]["area_mm2"] = -99.0
+    named = dict(experiment.told(rows))
+    assert len(named) == 9 + 3
+    assert [n["slope_deg"] for n in named.values()][-3:] == [41.0, 20.0, 20.0]
+    said = experiment.words(rows)
+    assert "area depends most on speed across the fan (v_y, +0.1 m/s): -99.00 mm²." in said
+    assert "slope, up to the right, depends most on all heights (+100.0 mm): +41.00 deg." in said
