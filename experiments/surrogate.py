@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-import agents
 from agents.surrogate_data import Bead, digest, read_beads, split
 from experiments import command, results, surrogate_figures
 from experiments import surrogate_ladder as ladder
@@ -294,14 +293,14 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--weights", type=Path, help="judge the weights of this folder (agents/weights) and train nothing"
     )
     parser.add_argument(
-        "--save", type=Path, help=f"folder for what is trained (default: OUT; shipped: {agents.WEIGHTS.name})"
+        "--save", type=Path, help="folder for what is trained (default: OUT/weights; shipped: agents/weights)"
     )
     parser.add_argument("--epochs", type=int, default=14, help="of each network (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="first training seed (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=1, help="training seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
     options = command.checked(parser, arguments, epochs=1, seed=0, seeds=1)
-    options.save = options.save or options.out
+    options.save = options.save or options.out / "weights"
     return options
 
 

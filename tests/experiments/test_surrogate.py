@@ -7,13 +7,15 @@ import math
 import numpy as np
 import pytest
 
+from agents import WEIGHTS
+from agents.surrogate_data import OBSTACLE_COURSE, read_beads
 from experiments import surrogate as experiment
 from experiments import surrogate_ladder as ladder
 from experiments import surrogate_metrics as metrics
 from experiments.surrogate_ladder import Rung
 from seal_gym.sealant.laydown.config import THESIS_FLOW_M3S
 from seal_gym.sealant.laydown.paths import TRAINING
-from seal_gym.sealant.surrogate import SurrogateCfg
+from seal_gym.sealant.surrogate import SurrogateCfg, features, load_surrogate
 from tests.agents.surrogate_beads import bead, write
 
 
@@ -167,3 +169,22 @@ def test_the_words_name_every_motion(small):
     said = experiment.words(rows)
     assert "area depends most on speed across the fan (v_y, +0.1 m/s): -99.00 mm²." in said
     assert "slope, up to the right, depends most on all heights (+100.0 mm): +41.00 deg." in said
+
+
+def test_the_shipped_surrogate_beats_the_fast_tier_and_the_glass_box_on_the_course():
+    beads = read_beads(experiment._DATA)
+    assert {b.path for b in beads} <= set(OBSTACLE_COURSE)
+    best, glass = (load_surrogate(WEIGHTS / ladder.SHIPPED[key]) for key in ("best", "linear"))
+    told = [set(model.card["beads"][k]) for model in (best, glass) for k in ("train", "held_out")]
+    assert not {f"{b.path}/{b.draw}" for b in beads} & set.union(*told)
+    scores = {}
+    for name, predict in (
+        ("best", best.predict),
+        ("glass", glass.predict),
+        ("fan", lambda bead: features(bead).fan()),
+    ):
+        rows = [metrics.scores(predict(bead), bead) for bead in beads]
+        scores[name] = [float(np.mean([r[key] for r in rows])) for key in ("iou", "area_error_pct")]
+    for other in ("glass", "fan"):
+        assert scores["best"][0] > scores[other][0]
+        assert scores["best"][1] < scores[other][1]
