@@ -104,7 +104,11 @@ def told(rows: list[Row]) -> list[tuple[str, Row]]:
     ]
     heights = [r for r in rows if r["input"] not in _WORDS]
     left, right = heights[: len(heights) // 2], heights[len(heights) // 2 + 1 :]
-    for title, chosen in (("all heights", heights), ("heights to the left", left), ("to the right", right)):
+    for title, chosen in (
+        ("all heights", heights),
+        ("heights to the left", left),
+        ("heights to the right", right),
+    ):
         mean = 1e3 * float(np.mean([r["one_sd"] for r in chosen]))
         total = {k: sum(r[k] for r in chosen) for k in _EFFECTS}
         named.append((f"{title} (+{mean:.1f} mm)", total))
