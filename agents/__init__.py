@@ -186,7 +186,13 @@ def load_policy(
     found = _find(name, trust_zip)
     if env is None:
         return found.make(None)
-    cfg = getattr(env, "unwrapped", env).core.cfg
+    core = getattr(getattr(env, "unwrapped", env), "core", None)
+    if core is None:
+        raise ConfigError(
+            f"policy {name!r} seals, and {env} is no sealing environment; for palettes there is "
+            "agents.palette_expert.PaletteExpert"
+        )
+    cfg = core.cfg
     if cfg.control != found.control:
         raise ConfigError(
             f"policy {name!r} acts with control={found.control!r}, the environment has {cfg.control!r}: "

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,28 @@ class PaletteExpert:
         """
         self._cell, self._cfg = cell or load_cell(), cfg or PaletteExpertCfg()
         self._dt = self._cell.timing.frame_s
+
+    @classmethod
+    def of(cls, env: Any, cfg: PaletteExpertCfg | None = None) -> Self:
+        """The expert for an environment.
+
+        Args:
+            env: A ``PaletteEnv``, wrapped or not.
+            cfg: How the tool moves.
+
+        Returns:
+            The expert, with the environment's cell.
+
+        Raises:
+            ConfigError: If the environment takes other actions.
+        """
+        settings = env.unwrapped.cfg
+        require(
+            settings.control == cls.control,
+            f"control = {settings.control!r}: the expert acts with control={cls.control!r}; make the "
+            "environment with that",
+        )
+        return cls(settings.cell, cfg)
 
     def predict(
         self,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from agents import Policy
 from seal_gym.core.cell import CellCfg, load_cell
-from seal_gym.core.errors import require
+from seal_gym.core.errors import ConfigError, require
 from seal_gym.core.frames import Array
 from seal_gym.core.kinematics import HOME_Q, tip_kinematics
 from seal_gym.envs.adapters import CHOLESKY_SCALE, CONTROLS, tip_scale
@@ -108,7 +108,7 @@ def play_from_home(
         the way back) and ``home_touched`` (whether anything was touched on it).
 
     Raises:
-        ConfigError: If the hover is out of reach from home.
+        ConfigError: If the hover is out of reach from home, or a wrapper cuts the episode short.
     """
     observation, info = env.reset(seed=seed, options={"start": "home"})
     cell, control, total = env.unwrapped.core.cfg.cell, policy.control, 0.0
@@ -125,6 +125,10 @@ def play_from_home(
         observation, reward, terminated, truncated, info = env.step(action)
         total, done = total + float(reward), terminated or truncated
         look(env, info)
+    if "episode_metrics" not in info:
+        raise ConfigError(
+            "the episode was cut short by a wrapper: give play_from_home an environment without TimeLimit"
+        )
     metrics = {**info["episode_metrics"], "return": total, "seed": seed}
     if not metrics["reached"]:
         return metrics

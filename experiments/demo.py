@@ -20,7 +20,7 @@ import agents
 from agents import engines
 from experiments import command, results, trials
 from experiments.pictures import Recorder
-from seal_gym.core.errors import RenderError, SealGymError
+from seal_gym.core.errors import ConfigError, RenderError, SealGymError
 from seal_gym.envs.config import PERCEPTIONS, RENDERERS
 from seal_gym.workpieces.catalogue import NAMES
 
@@ -88,17 +88,30 @@ def show(trial: trials.Trial, out: Path, *, video: bool) -> bool:
     Returns:
         Whether the video could be made, if one was asked for.
     """
-    recorder, made = Recorder(video=video), video
+    made = video
     try:
-        trials.run(trial, recorder, "rgb_array" if video else None, from_home=True)
+        recorder = _recorded(trial, video)
     except RenderError as error:
         sys.stderr.write(f"no video: {error}\n")
-        recorder, made = Recorder(video=False), False
-        trials.run(trial, recorder, from_home=True)
+        recorder, made = _recorded(trial, False), False
     if recorder.frames:
         recorder.write_video(out / f"{trial.part}.mp4")
     recorder.plot(out / f"{trial.part}.png", f"{trial.part}, {trial.method}, seed {trial.seed}")
     return made
+
+
+def _recorded(trial: trials.Trial, video: bool) -> Recorder:
+    """The run from home; where home or the way from it is blocked, from the hover."""
+    mode = "rgb_array" if video else None
+    recorder = Recorder(video=video)
+    try:
+        trials.run(trial, recorder, mode, from_home=True)
+    except ConfigError as error:
+        sys.stderr.write(f"{trial.part} from the hover, not from home: {error}\n")
+    if not recorder.time_s:
+        recorder = Recorder(video=video)
+        trials.run(trial, recorder, mode)
+    return recorder
 
 
 def main(arguments: list[str] | None = None) -> int:

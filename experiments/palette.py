@@ -100,7 +100,7 @@ def play(env: PaletteEnv, seed: int, pictures: list[NDArray[np.uint8]] | None = 
     Returns:
         The metrics, and the run.
     """
-    policy, memory, done = PaletteExpert(env.cfg.cell), None, False
+    policy, memory, done = PaletteExpert.of(env), None, False
     observation, info = env.reset(seed=seed)
     seen_mm = _seen_mm(env)
     tips, commands, forces, home = [], [], [], []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.video import open_video
+from seal_gym.core.errors import RenderError
 from seal_gym.core.frames import Array
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.workpieces.surface import Surface
@@ -140,7 +141,12 @@ class Recorder:
         Args:
             path: The PNG file.
             title: Above the plots.
+
+        Raises:
+            RenderError: If the run ended before the gun was in its hover.
         """
+        if not self.time_s:
+            raise RenderError(f"{title}: nothing to plot, the run ended on the way from home")
         tip, desired = np.asarray(self.tip_mm), self.desired_mm
         sealing = np.asarray(self.s_mm) >= 0
         figure, (top, side, error) = plt.subplots(

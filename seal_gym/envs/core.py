@@ -287,7 +287,8 @@ class SealCore:
         action = self._checked(action)
         delayed = self._disturbances.delayed(action)
         qdd = self.adapter(delayed[:, : self.adapter.size], self.arm_state())
-        touched = self.arm.step(qdd, self._disturbances.outside(self.frames, self.progress.s))
+        outside = self._disturbances.outside(self._clock, self.progress.s, self.journey.under_way)
+        touched = self.arm.step(qdd, outside)
         self.frames += 1
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
@@ -316,6 +317,11 @@ class SealCore:
             return features
         images = self._images or self._look()
         return {"features": features, "front": images.front, "side": images.side}
+
+    @property
+    def _clock(self) -> NDArray[np.int64]:
+        """Frames that disturbances go by: they wait until the gun is in its hover, shape (N,)."""
+        return self.frames - self.journey.frames
 
     # -- the parts of a step ----------------------------------------------------------------------------
 
@@ -402,17 +408,17 @@ class SealCore:
             return self._vision.update(self._images.front, self._images.side, self.tip.pose, rows)
         point, tangent = seam_in_world(self._seam, self.progress.s, self.arm.part_pose)
         lines = oracle_lines(point, tangent, self._disturbances.bracket(self.tip.pose), self._views)
-        return self._disturbances.lines(lines, self.frames)
+        return self._disturbances.lines(lines, self._clock)
 
     def _exposed(self) -> Images:
         """The images as the cameras take them now."""
-        self._disturbances.illuminate(self.sensors.look, self.frames)
+        self._disturbances.illuminate(self.sensors.look, self._clock)
         bead = None if self.extrusion is None else self.extrusion.view()
         return self.sensors.images(self._disturbances.bracket(self.tip.pose), self.arm, self.frames, bead)
 
     def _look(self) -> Images:
         """The images as they arrive now."""
-        return self._disturbances.images(self._exposed(), self.frames)
+        return self._disturbances.images(self._exposed(), self._clock)
 
     def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
         looking = ~self.journey.under_way
@@ -468,12 +474,12 @@ class SealCore:
         Velocity of their origins and angular velocity in the base frame, shape (N, 6), m/s and rad/s; None if
         they stand still.
         """
-        return self._disturbances.part_twist(self.frames)
+        return self._disturbances.part_twist(self._clock)
 
     @property
     def obstacle(self) -> Obstacle | None:
         """Where ``MovingObstacle`` is; None if there is none."""
-        return self._disturbances.obstacle(self.frames)
+        return self._disturbances.obstacle(self._clock)
 
     @property
     def images(self) -> Images:
@@ -550,7 +556,8 @@ class SealCore:
             Outcome and metrics as protocol.md names them; ``rmse_mm`` is None if the tip did not come far
             enough: a NaN would not equal itself where infos are compared.
         """
-        metrics = {k: None if np.isnan(v) else v for k, v in self.progress.metrics(i).items()}
+        unknown = self.journey.under_way[i]  # what a gun that never arrived was off by
+        metrics = {k: None if unknown or np.isnan(v) else v for k, v in self.progress.metrics(i).items()}
         names = ("collision", "reached", "lost", "timeout")
         outcome = next((name for name in names if getattr(result, name)[i]), "running")
         return {

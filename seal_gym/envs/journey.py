@@ -22,11 +22,11 @@ def check_start(options: dict[str, object] | None) -> str:
     Raises:
         ConfigError: If there is another option or another start.
     """
-    rest = dict(options or {})
-    start = rest.pop("start", STARTS[0])
-    if rest or start not in STARTS:
+    rest = dict(options) if isinstance(options, dict) else options or {}
+    start = rest.pop("start", STARTS[0]) if isinstance(rest, dict) else None
+    if rest or not (isinstance(start, str) and start in STARTS):
         raise ConfigError(f"options = {options!r}: reset takes {{'start': one of {list(STARTS)}}}")
-    return str(start)
+    return start
 
 
 class Journey:

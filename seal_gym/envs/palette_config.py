@@ -53,7 +53,7 @@ class PlacementCfg:
         for name in ("home_m", "spread_m"):
             value = getattr(self, name)
             require(
-                len(value) == 3 and all(map(is_number, value)),
+                np.shape(value) == (3,) and all(map(is_number, value)),
                 f"PlacementCfg.{name} = {value!r}: must be 3 finite numbers",
             )
 
@@ -118,7 +118,8 @@ class PaletteCfg:
         choices = (("control", CONTROLS), ("perception", PERCEPTIONS), ("observation", OBSERVATIONS))
         for name, allowed in choices:
             value = getattr(self, name)
-            require(value in allowed, f"{name} = {value!r}: must be one of {list(allowed)}")
+            ok = isinstance(value, str) and value in allowed
+            require(ok, f"{name} = {value!r}: must be one of {list(allowed)}")
         kinds = {
             "layout": LayoutCfg,
             "placement": PlacementCfg,

@@ -123,7 +123,7 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ``terminated``: *reached* (all ties home), *collision* (150 N or more on anything: the arm's protective
     stop). ``truncated``: *timeout* (10 s and 8 s a tie). A wrong touch does not end an episode: it counts.
-    Steps after the end without a ``reset`` earn nothing.
+    Steps after the end without a ``reset`` earn nothing and keep the outcome.
 
     ## Info
 
@@ -165,7 +165,8 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         self._look = Look.empty(1)
         self._picture: Picture | None = None
         self._renderer: mujoco.Renderer | None = None
-        self._running = self._ended = False
+        self._running = False
+        self._final: Events | None = None
 
     def _space(self) -> spaces.Space[Any]:
         features = spaces.Box(_LOWER.astype(np.float32), _BOUND.astype(np.float32), dtype=np.float32)
@@ -220,7 +221,7 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         self._picture = self.look() if sees else None
         self.place_m = self._places()
         self.place_open = np.ones(len(self.place_m), np.bool_)
-        self._running, self._ended = True, False
+        self._running, self._final = True, None
         return self._observe(), self._info(None)
 
     def _start(self, rng: np.random.Generator) -> None:
@@ -245,8 +246,8 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         if self.cfg.perception == "oracle":
             return self.target_m
         assert self._picture is not None
-        seen = self.cfg.observer(self._picture.rgb, self._picture.depth_m, self.cfg.camera)
-        return targets_of(seen)[:MAX_TARGETS]
+        places = targets_of(self.cfg.observer(self._picture.rgb, self._picture.depth_m, self.cfg.camera))
+        return places[:MAX_TARGETS]
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advances one frame.
@@ -269,12 +270,13 @@ class PaletteEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
         self.arm.step(qdd)
         self._tip_accel = (command.jacobian @ qdd[:, :, None])[0, :, 0] + command.drift[0]
         self.tip = tip_kinematics(self.arm.q, self.arm.qd)
-        events = self._score()
+        events = self._final if self._final is not None else self._score()
         change = 0.5 * float(np.abs(move - self._action).mean())
         self._action = move
-        earned = 0.0 if self._ended else reward(events, change, self.cfg.reward)
+        earned = reward(events, change, self.cfg.reward) if self._final is None else 0.0
         terminated = events.completed or events.stopped
-        self._ended = self._ended or terminated or events.timeout
+        if terminated or events.timeout:
+            self._final = events
         return self._observe(), earned, terminated, events.timeout, self._info(events)
 
     def _checked(self, action: Any) -> Array:

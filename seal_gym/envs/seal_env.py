@@ -41,7 +41,8 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
     ``reset(options={"start": "home"})`` begins with the arm at rest (``kinematics.HOME_Q``) above the table,
     the same hover ahead: the info's ``hover_pose`` says where. Until the gun has been there (3 mm, 3 deg)
-    neither view is valid, no error counts and the sealant's valve stays shut; the time limit is 10 s longer.
+    neither view is valid, no error counts, part and other disturbances stand still and the sealant's valve
+    stays shut; the time limit is 10 s longer.
 
     The tip frame has its origin at the nozzle mouth, x to the right of travel, y along travel, z back along
     the nozzle. One step is one camera frame, 1/30 s.

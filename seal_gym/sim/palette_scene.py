@@ -52,7 +52,7 @@ _LIMIT_SOLREF = (0.0085, 1.0)
 _STRAP_M = 0.005
 _G, _S = mujoco.mjtGeom, mujoco.mjtSensor
 # Contact sensors: bits of found and force, reduced to the net force in the world frame.
-_FOUND_AND_FORCE, _NET_FORCE = 0b11, 3
+_FOUND_AND_FORCE, _LARGEST, _NET_FORCE = 0b11, 2, 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +61,7 @@ class PaletteScene:
 
     Sensor data, in order: for each target the number of contacts of the pad with its tie and their net force
     in the world frame (4 numbers), then for each of ``CLASSES`` the same of the arm and tool with it, then
-    each target's slide.
+    the largest force in any contact of arm and tool, then each target's slide.
 
     Attributes:
         model: The MuJoCo model; joints 6.. are the targets' slides, equality constraints their latches.
@@ -82,7 +82,7 @@ class Touches:
         press_n: Force of the pad on each target along its slide, shape (S, n), N.
         slide_m: How far each target has been pressed, shape (S, n), m.
         wrong: Whether each of ``CLASSES`` and, last, anything else was touched, shape (S, 7).
-        wrong_n: Force on each of ``CLASSES``, shape (S, 6), N.
+        wrong_n: Force on each of ``CLASSES``; last, the largest in any contact, shape (S, 7), N.
     """
 
     press_n: Array
@@ -103,10 +103,10 @@ def read_touches(scene: PaletteScene, contacts: Array, sensors: Array) -> Touche
         See ``Touches``.
     """
     n, steps = len(scene.layout.targets), len(contacts)
-    pairs = sensors[:, : 4 * (n + len(CLASSES))].reshape(steps, -1, 4)
+    pairs = sensors[:, : 4 * (n + len(CLASSES) + 1)].reshape(steps, -1, 4)
     press = np.abs(pairs[:, :n, 3])  # the palette lies level: its ties slide along the world's z
     force = np.linalg.norm(pairs[:, n:, 1:], axis=2)
-    count = pairs[:, :, 0]
+    count = pairs[:, :-1, 0]
     other = contacts - count.sum(axis=1)
     wrong = np.column_stack((count[:, n:], other)) > 0
     return Touches(press_n=press, slide_m=-sensors[:, -n:], wrong=np.asarray(wrong), wrong_n=force)
@@ -247,6 +247,12 @@ def _add_sensors(spec: mujoco.MjSpec, targets: int) -> None:
             refname=name,
             **contact,
         )
+    spec.add_sensor(
+        name="touch",
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname="base_link",
+        **contact | {"intprm": [_FOUND_AND_FORCE, _LARGEST, 1]},
+    )
     for k in range(targets):
         spec.add_sensor(
             name=f"slide_{k}",

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from seal_gym.core.cell import OverheadCfg
+from seal_gym.core.errors import require
 from seal_gym.core.frames import Array
 
 Depth = NDArray[np.floating[Any]]
@@ -62,9 +63,18 @@ def targets_of(seen: Seen) -> Array:
 
     Returns:
         Shape (n, 3), m.
+
+    Raises:
+        ConfigError: If it is not what an observer has to give.
     """
-    chosen = [k for k, name in enumerate(seen.classes) if name in TARGET_CLASSES]
-    return np.reshape(np.asarray(seen.position_m, dtype=np.float64)[chosen], (-1, 3))
+    places = np.asarray(getattr(seen, "position_m", None), dtype=np.float64)
+    classes = list(getattr(seen, "classes", ()))
+    require(
+        places.shape == (len(classes), 3) and bool(np.isfinite(places).all()),
+        f"the observer gave {type(seen).__name__} with position_m of shape {places.shape} and {len(classes)} "
+        "classes: must have finite position_m of shape (n, 3), in m, and n classes",
+    )
+    return places[[name in TARGET_CLASSES for name in classes]]
 
 
 def deproject(pixel: Array, depth_m: Array | float, camera: OverheadCfg) -> Array:

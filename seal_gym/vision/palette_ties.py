@@ -55,8 +55,12 @@ class TieObserver:
         Returns:
             Elements and faults.
         """
+        require(bool(np.isfinite(depth_m).any()), "depth_m: no pixel has a depth: nothing can be seen")
         inside = above(depth_m, camera, self.floor_m)
-        require(bool(inside.any()), f"depth_m: nothing is above floor_m = {self.floor_m} m: lower it")
+        require(
+            bool(inside.any()),
+            f"depth_m: nothing is above floor_m = {self.floor_m} m: lower it, or mend the gaps in depth_m",
+        )
         depth = np.asarray(depth_m, dtype=np.float64)
         return observe(rgb, depth, camera, network=self.network, cfg=self.cfg, inside=inside)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from seal_gym.core.errors import ConfigError, require
+from seal_gym.core.errors import ConfigError, is_number, require
 from seal_gym.core.frames import Array
 
 BOARD_M = (0.36, 0.26, 0.02)
@@ -36,9 +36,13 @@ _ROW_M = 0.105
 _MAX_DRAWS = 200
 
 
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2 and all(map(is_number, value))
+
+
 def _whole_range(name: str, value: tuple[int, int], low: int, high: int) -> None:
     require(
-        all(int(v) == v for v in value) and low <= value[0] <= value[1] <= high,
+        _is_pair(value) and all(int(v) == v for v in value) and low <= value[0] <= value[1] <= high,
         f"LayoutCfg.{name} = {value!r}: must be (fewest, most), whole numbers within {low}..{high}",
     )
 
@@ -75,14 +79,15 @@ class LayoutCfg:
         _whole_range("rivets", self.rivets, 0, 40)
         _whole_range("pegs", self.pegs, 0, 30)
         for name in ("connector_height_m", "peg_height_m"):
-            low, high = getattr(self, name)
+            value = getattr(self, name)
             require(
-                0.005 <= low <= high <= 0.07,
-                f"LayoutCfg.{name} = {(low, high)!r}: must be (lowest, highest), both within 0.005..0.07 m: "
+                _is_pair(value) and 0.005 <= value[0] <= value[1] <= 0.07,
+                f"LayoutCfg.{name} = {value!r}: must be (lowest, highest), both within 0.005..0.07 m: "
                 "the tool's pusher clears little more",
             )
         require(
-            0.02 <= self.apart_m <= 0.1, f"LayoutCfg.apart_m = {self.apart_m!r}: must be within 0.02..0.1 m"
+            is_number(self.apart_m) and 0.02 <= self.apart_m <= 0.1,
+            f"LayoutCfg.apart_m = {self.apart_m!r}: must be a number within 0.02..0.1 m",
         )
 
 

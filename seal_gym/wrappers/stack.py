@@ -110,12 +110,13 @@ class Disturbances:
         """
         return self._delay(action) if self._delay else action
 
-    def outside(self, frame: NDArray[np.int64], s: Array) -> Outside | None:
+    def outside(self, frame: NDArray[np.int64], s: Array, held: NDArray[np.bool_]) -> Outside | None:
         """What moves and pushes in the coming frame.
 
         Args:
             frame: Frames since each reset, shape (N,).
             s: Arc length that the tips have come to, shape (N,), m.
+            held: For which nothing moves yet, shape (N,).
 
         Returns:
             Bodies and forces in each physics step; None if there are none.
@@ -124,6 +125,7 @@ class Disturbances:
             return None
         # By whole steps, so that a frame begins at the very pose where the last one ended.
         t = np.asarray((frame[:, None] * self._substeps + self._steps) * self._step_s, dtype=np.float64)
+        t[held] = 0.0
         if self._fist:
             self._fist.watch(s, t[:, 0])
         return Outside(

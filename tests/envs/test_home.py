@@ -6,7 +6,8 @@ import pytest
 
 import agents
 from agents.travel import Follower, play_from_home
-from seal_gym.core.errors import ConfigError
+from experiments.pictures import Recorder
+from seal_gym.core.errors import ConfigError, RenderError
 from seal_gym.core.kinematics import HOME_Q, tip_kinematics
 from seal_gym.envs.sb3 import SealSb3VecEnv
 from seal_gym.envs.seal_env import SealEnv
@@ -139,7 +140,44 @@ def test_sb3s_environments_start_at_home_once(make):
     sb3.close()
 
 
-@pytest.mark.parametrize("options", [{"start": "nowhere"}, {"begin": "home"}, {"start": None}])
+def test_a_moving_part_waits_until_the_gun_is_there(make):
+    kwargs = {"workpiece": "flat", "perception": "vision", "control": "rmp"}
+    env = make(**kwargs, disturbances=["MovingWorkpiece"])
+    poses = []
+    metrics = play_from_home(
+        agents.load_policy("rmp_expert", env),
+        env,
+        500_002,
+        lambda e, info: poses.append((info["under_way"], e.core.arm.part_pose[0, :3, 3].copy())),
+    )
+    still = np.array([p for u, p in poses if u])
+    np.testing.assert_array_equal(still, still[:1].repeat(len(still), axis=0))
+    assert metrics["reached"] and np.ptp([p for u, p in poses if not u], axis=0).max() > 5e-3
+    # From the hover the part moves the same way: the same draws, the same clock.
+    env.reset(seed=500_002)
+    for _ in range(3):
+        env.step(np.zeros(27, np.float32))
+    np.testing.assert_array_equal(env.core.arm.part_pose[0, :3, 3], poses[len(still) + 2][1])
+
+
+def test_what_ends_on_the_way_has_no_errors_and_no_plot(make, tmp_path):
+    env, recorder = make(workpiece="flat"), Recorder(video=False)
+    _, info = env.reset(seed=0, options=HOME)
+    done = False
+    while not done:
+        _, _, terminated, truncated, info = env.step(np.array([0, 0, -0.3, 0, 0, 0], np.float32))
+        recorder(env, info)
+        done = terminated or truncated
+    assert info["episode_metrics"]["collision"]
+    assert info["episode_metrics"]["rmse_whole_mm"] is None and info["episode_metrics"]["rmse_mm"] is None
+    with pytest.raises(RenderError, match="on the way from home"):
+        recorder.plot(tmp_path / "a.png", "flat")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"start": "nowhere"}, {"begin": "home"}, {"start": None}, "home", ["start"], {"start": np.ones(2)}],
+)
 def test_other_options_are_refused(make, options):
     with pytest.raises(ConfigError, match="start"):
         make(workpiece="flat").reset(options=options)

@@ -5,15 +5,18 @@ import pickle
 from dataclasses import replace
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 import seal_gym
+from agents import load_policy
 from agents.palette_expert import Memory, PaletteExpert, PaletteExpertCfg
 from seal_gym.core.errors import ActionError, ConfigError
 from seal_gym.core.frames import transform
 from seal_gym.core.kinematics import tip_kinematics
+from seal_gym.envs.palette_config import PlacementCfg
 from seal_gym.envs.palette_env import PALETTE_ROWS, WRONG, PaletteEnv
 from seal_gym.planning.tau_jerk import RateLimitsCfg
 from seal_gym.vision import palette_threshold
@@ -189,6 +192,66 @@ def test_the_tie_observer_tells_the_palette_from_the_table(make):
         replace(observer, floor_m=5.0).report(env.picture.rgb, env.picture.depth_m, env.cfg.camera)
     with pytest.raises(ConfigError, match="floor_m"):
         replace(observer, floor_m=math.nan)
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        (None, r"NoneType.*shape \(n, 3\)"),
+        (Regions(np.zeros((2, 3)), ("tie",)), "1 classes"),
+        (Regions(np.zeros((3, 2)), ("tie",) * 3), r"shape \(3, 2\)"),
+        (Regions(np.full((1, 3), np.nan), ("tie",)), "finite"),
+    ],
+)
+def test_an_observer_that_gives_nonsense_is_named(make, seen, message):
+    with pytest.raises(ConfigError, match=message):
+        make(observer=lambda rgb, depth_m, camera: seen).reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: LayoutCfg(targets=4),
+        lambda: LayoutCfg(targets=(4,)),
+        lambda: LayoutCfg(targets=(math.nan, 8)),
+        lambda: LayoutCfg(connector_height_m=0.02),
+        lambda: LayoutCfg(apart_m="x"),
+        lambda: PlacementCfg(home_m=3),
+        lambda: PaletteEnv(control=np.array(["tip"])),
+    ],
+)
+def test_values_of_the_wrong_kind_are_named(build):
+    with pytest.raises(ConfigError, match="must be"):
+        build()
+
+
+def test_the_table_stops_the_arm_as_anything_else(make):
+    """The tool is driven straight down beside the palette: MuJoCo's own contact force is the truth."""
+    env = make(control="tip", perception="oracle")
+    env.reset(seed=500_000)
+    largest = 0.0
+    for _ in range(300):
+        *_, terminated, _, info = env.step(np.array([0, 0, -0.2, 0, 0, 0], np.float32))
+        if terminated:
+            break
+    assert terminated and info["collision"] and info["touched"] == ["other"]
+    assert info["episode_metrics"]["peak_force_n"] >= 150.0 and info["episode_metrics"]["wrong_other"] == 1
+    data = env.arm.data(0)
+    for k in range(data.ncon):
+        force = np.zeros(6)
+        mujoco.mj_contactForce(env.scene.model, data, k, force)
+        largest = max(largest, float(np.linalg.norm(force[:3])))
+    assert largest > 50.0
+    for _ in range(5):  # what has ended stays as it ended
+        _, earned, terminated, truncated, again = env.step(np.array([0, 0, 1, 0, 0, 0], np.float32))
+        assert (earned, terminated, truncated, again["collision"]) == (0.0, True, False, True)
+
+
+def test_the_expert_is_told_of_the_wrong_control(make):
+    with pytest.raises(ConfigError, match="control='joint'"):
+        PaletteExpert.of(make(control="tip"))
+    with pytest.raises(ConfigError, match="PaletteExpert"):
+        load_policy("rmp_expert", make())
 
 
 def test_any_observer_can_be_used(make):
