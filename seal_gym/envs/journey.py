@@ -1,5 +1,7 @@
 """Guns that start at the arm's home: which are still on their way to the hover where they begin to look."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ STARTS = ("hover", "home")
 _NEAR_M, _NEAR_RAD = 3e-3, np.deg2rad(3.0)
 
 
-def check_start(options: dict[str, object] | None) -> str:
+def check_start(options: Any) -> str:
     """Where an episode starts.
 
     Args:
@@ -22,9 +24,9 @@ def check_start(options: dict[str, object] | None) -> str:
     Raises:
         ConfigError: If there is another option or another start.
     """
-    rest = dict(options) if isinstance(options, dict) else options or {}
-    start = rest.pop("start", STARTS[0]) if isinstance(rest, dict) else None
-    if rest or not (isinstance(start, str) and start in STARTS):
+    rest = dict(options) if isinstance(options, dict) else {"": options} if options is not None else {}
+    start = rest.pop("start", STARTS[0])
+    if rest or not isinstance(start, str) or start not in STARTS:
         raise ConfigError(f"options = {options!r}: reset takes {{'start': one of {list(STARTS)}}}")
     return start
 

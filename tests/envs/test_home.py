@@ -157,7 +157,7 @@ def test_a_moving_part_waits_until_the_gun_is_there(make):
     env.reset(seed=500_002)
     for _ in range(3):
         env.step(np.zeros(27, np.float32))
-    np.testing.assert_array_equal(env.core.arm.part_pose[0, :3, 3], poses[len(still) + 2][1])
+    np.testing.assert_array_equal(env.core.arm.part_pose[0, :3, 3], poses[len(still) + 3][1])
 
 
 def test_what_ends_on_the_way_has_no_errors_and_no_plot(make, tmp_path):
