@@ -312,20 +312,21 @@ def markdown(rows: list[Row], cell_mm: float) -> str:
     )
     about = (
         f"OpenFOAM (interFoam), cells of {cell_mm:g} mm, neutral silicone, a fan of 40 deg whose jet "
-        f"leaves at 3 m/s with the tip's velocity added; paths in pieces of about {1e3 * PIECE_M:g} mm that "
-        f"overlap by {1e3 * OVERLAP_M:g} mm, so that beginning and end of a closed path do not meet. "
-        "Height at an edge: mean over the columns within 1 mm of a place 2 mm inside it, every millimetre, smallest to "
-        "largest over both edges; the same places and columns as in the fast tier's table (bead_paths.md). "
-        "Difference at corners: between left and right edge where the centre line turns at least half as "
-        "sharply as it does anywhere, mean (largest). Reduction: the naive mean difference over the optimal "
-        "one. From the fast tier: root mean square difference of the heights at both edges."
+        f"leaves at 3 m/s with the tip's velocity added; paths in pieces of about {1e3 * PIECE_M:g} mm "
+        f"that overlap by {1e3 * OVERLAP_M:g} mm, so that beginning and end of a closed path do not meet. "
+        "Height at an edge: mean over the columns within 1 mm of a place 2 mm inside it, every "
+        "millimetre, smallest to largest over both edges; the same places and columns as in the fast "
+        "tier's table (bead_paths.md). Difference at corners: between left and right edge where the "
+        "centre line turns at least half as sharply as it does anywhere, mean (largest). Reduction: the "
+        "naive mean difference over the optimal one. From the fast tier: root mean square difference of "
+        "the heights at both edges."
     )
     sizes = (
         f"Width: mean over the path, where the bead is at least {1e3 * BEAD_M:g} mm high; area: mean, of "
-        "what lies on the columns (in the half circle without what fills the gap); Q / v: sprayed volume over the "
-        "centre line's length; volume: worst relative error of a piece's volume; CPU time of the solver, one "
-        "core. The thesis' Figs. 4.1, 4.3, 4.5 and 4.7 show simulated beads of the first four cases as "
-        "pictures without scales or numbers: there is nothing to compare figures with."
+        "what lies on the columns (in the half circle without what fills the gap); Q / v: sprayed volume "
+        "over the centre line's length; volume: worst relative error of a piece's volume; CPU time of the"
+        " solver, one core. The thesis' Figs. 4.1, 4.3, 4.5 and 4.7 show simulated beads of the first "
+        "four cases as pictures without scales or numbers: there is nothing to compare figures with."
     )
     pictures = [f"![{row['case']}]({NAME}_{row['case']}.png)" for row in rows]
     return "\n\n".join((first, about, second, sizes, *pictures))
