@@ -19,6 +19,7 @@ from seal_gym.planning.bead_refine import Evaluator, shares
 from seal_gym.sealant.laydown.config import GridCfg
 from seal_gym.sealant.laydown.jet import emit
 from seal_gym.sealant.laydown.pieces import trace
+from seal_gym.sealant.laydown.sections import COLUMNS, PIXEL_M, Stations, stations
 from seal_gym.sealant.laydown.substrates import SUBSTRATES
 from seal_gym.sealant.strip import Strip
 
@@ -27,6 +28,7 @@ _BLUR_M = 1e-3
 _EMIT_S = 4e-3  # four emissions in each
 _POSES = 600
 _SMOOTH = 9  # places, 1 mm apart
+_NEAR = 9  # samples of sections around a place
 
 
 def place_points(strip: Strip, at: Array) -> Array:
@@ -101,6 +103,41 @@ class Ballistic:
                 pile += np.bincount(index, weights=jet.volumes_m3 * weight, minlength=len(pile))
         height = gaussian_filter(pile.reshape(size) / _PIXEL_M**2, _BLUR_M / _PIXEL_M, mode="constant")
         return np.asarray(map_coordinates(height, np.moveaxis((places - low) / _PIXEL_M, -1, 0), order=1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sections:
+    """Cross-sections of the bead by their stations, as a surrogate predicts them.
+
+    Attributes:
+        predict: Volume fractions, shape (n, 20, 40), from n stations.
+        left: x and y of the places inside the left edge, shape (m, 2), m.
+        right: Inside the right edge, shape (m, 2), m.
+        fan_angle_rad: theta [rad].
+    """
+
+    predict: Callable[[Stations], Array]
+    left: Array
+    right: Array
+    fan_angle_rad: float
+
+    def __call__(self, paths: Sequence[BeadPath]) -> Array:
+        """Heights of beads; see ``bead_refine.Evaluator``."""
+        return np.array([self._one(path) for path in paths])
+
+    def _one(self, path: BeadPath) -> Array:
+        plane = SUBSTRATES["plane"]
+        at = stations(simulation(plane, thinned(path), self.fan_angle_rad, GridCfg()))
+        # A column leans with the tip: what stands in it is so much lower.
+        upright = at.tips[:, 2, 2]
+        height = self.predict(at).sum(axis=1) * PIXEL_M * upright[:, None]
+        across = (np.arange(COLUMNS) + 0.5 - COLUMNS / 2) * PIXEL_M
+        spot = at.hits[:, None, :2] + across[:, None] * at.tips[:, None, :2, 0]
+        tree = cKDTree(spot.reshape(-1, 2))
+        away, near = tree.query(np.concatenate((self.left, self.right)), k=_NEAR)
+        weight = np.exp(-0.5 * (away / (0.5 * PIXEL_M)) ** 2) + 1e-12
+        found = np.sum(weight * height.reshape(-1)[near], axis=1) / weight.sum(axis=1)
+        return np.asarray(found.reshape(2, -1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
