@@ -43,7 +43,7 @@ NAME = "bead_reference"
 PATHS = ("naive", "ipopt")
 PIECE_M, OVERLAP_M = 60e-3, 12e-3
 STEP_S = 2e-3  # the tip moves half a millimetre
-NEAR_M = 25e-3  # no column so far from where the jet's middle lands has sealant
+NEAR_M = 25e-3  # no column so far from where the nozzle points at has sealant
 BEAD_M = 0.5e-3  # a column is bead from this height on, as in ``laydown.sections``
 _LIMIT_S = 3600.0
 

@@ -15,7 +15,7 @@ from seal_gym.sealant.laydown.jet import fly
 from seal_gym.sealant.laydown.mesh import Mesh
 
 _TRACE_M = 1e-3
-_FLIGHT_M = 0.3  # no useful jet is longer
+_REACH_M = 0.3  # no useful jet is longer; at 1 m/s
 _SAMPLES = 4  # of a cell's edge, along a column
 
 
@@ -35,7 +35,9 @@ class Piece:
 
 
 def trace(cfg: LaydownCfg) -> tuple[Array, Array]:
-    """Where the middle of the jet lands.
+    """Where the nozzle points at.
+
+    Not where the jet lands: a nozzle that swings over an edge throws that far ahead and back again.
 
     Args:
         cfg: The simulation.
@@ -44,12 +46,12 @@ def trace(cfg: LaydownCfg) -> tuple[Array, Array]:
         Arc lengths (n,) and places (n, 3) at the path's times [m].
 
     Raises:
-        LaydownError: If it misses the substrate.
+        LaydownError: If it points past the substrate.
     """
-    path, speed = cfg.path, cfg.nozzle.jet_speed_mps
-    velocity = path.velocities(path.times_s) - speed * path.rotations[:, :, 2]
-    gravity = np.asarray(cfg.gravity_mps2)
-    _, place, _ = fly(path.positions, velocity, gravity, cfg.part.height, reach_s=_FLIGHT_M / speed)
+    path = cfg.path
+    _, place, _ = fly(
+        path.positions, -path.rotations[:, :, 2], np.zeros(3), cfg.part.height, reach_s=_REACH_M
+    )
     if np.isnan(place).any():
         raise LaydownError("the nozzle points past the substrate: tilt or drag less")
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))), place

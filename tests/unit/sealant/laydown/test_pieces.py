@@ -1,15 +1,15 @@
 """Pieces of long simulations, and thicknesses of synthetic volume fractions, by hand."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from seal_gym.core.errors import SealGymError
 from seal_gym.sealant.laydown import jet
 from seal_gym.sealant.laydown import mesh as meshes
-from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError, NozzleCfg, TcpPath
+from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError, TcpPath
 from seal_gym.sealant.laydown.pieces import between, split, thickness_m, trace
 from seal_gym.sealant.laydown.substrates import SUBSTRATES, Substrate
 from tests.unit.sealant.laydown.cases import FLOW_M3S, straight
@@ -33,11 +33,12 @@ def bent(leg_m=0.06, speed_mps=0.3, height_m=0.03):
     return LaydownCfg(path=path)
 
 
-def test_the_trace_runs_ahead_of_the_tip_by_its_speed_times_the_flight():
-    cfg = straight(gravity_mps2=(0.0, 0.0, 0.0))
-    arcs, places = trace(cfg)
-    np.testing.assert_allclose(places[:, 1] - cfg.path.positions[:, 1], 0.3 * 0.03 / 3.0, atol=1e-9)
-    np.testing.assert_allclose(arcs, [0.0, 0.03], atol=1e-9)
+def test_the_trace_is_where_the_nozzle_points_at():
+    turn = Rotation.from_euler("X", 20.0, degrees=True).as_matrix()
+    arcs, places = trace(straight(rotation=turn, gravity_mps2=(0.0, 9.81, 0.0)))
+    ahead = 0.03 * np.tan(np.radians(20.0))
+    np.testing.assert_allclose(places, [[0.0, ahead, 0.0], [0.0, 0.03 + ahead, 0.0]], atol=1e-8)
+    np.testing.assert_allclose(arcs, [0.0, 0.03], atol=1e-8)
 
 
 def test_a_part_of_a_path_is_the_path():
@@ -66,13 +67,10 @@ def test_pieces_fill_the_path_and_overlap():
 
 
 def test_no_cut_is_in_a_corner():
-    # The corner is half way, where the cut would be; a fast jet lands where the nozzle points at.
-    cfg = replace(bent(), nozzle=NozzleCfg(jet_speed_mps=20.0))
+    cfg = bent()  # its corner is half way: where the cut would be
     first, second = split(cfg, 60e-3, 10e-3)
     arcs, _ = trace(cfg)
-    # the jet's middle turns off at the corner, between the 30th and the 31st point
-    corner_m = arcs[29:31].mean()
-    assert abs(np.interp(first.end_s, cfg.path.times_s, arcs) - corner_m) > 9e-3
+    assert abs(np.interp(first.end_s, cfg.path.times_s, arcs) - 0.06) > 9e-3
     assert second.begin_s == first.end_s
 
 
