@@ -2,7 +2,8 @@
 
     python -m experiments.demo --out out/demo
 
-Writes a table, a video and a plot for each part, and ``demo.json`` with every trial.
+Writes a table, a video and a plot for each part, and ``demo.json`` with every trial. Videos and plots are of
+the first seed once more, from the arm's home to the seam and back.
 """
 
 from experiments import backend
@@ -77,7 +78,7 @@ def parts(options: argparse.Namespace) -> list[str]:
 
 
 def show(trial: trials.Trial, out: Path, *, video: bool) -> bool:
-    """Runs a trial once more, with pictures.
+    """Runs a trial once more with pictures, the arm coming from its home and going back there.
 
     Args:
         trial: What to run.
@@ -89,11 +90,11 @@ def show(trial: trials.Trial, out: Path, *, video: bool) -> bool:
     """
     recorder, made = Recorder(video=video), video
     try:
-        trials.run(trial, recorder, "rgb_array" if video else None)
+        trials.run(trial, recorder, "rgb_array" if video else None, from_home=True)
     except RenderError as error:
         sys.stderr.write(f"no video: {error}\n")
         recorder, made = Recorder(video=False), False
-        trials.run(trial, recorder)
+        trials.run(trial, recorder, from_home=True)
     if recorder.frames:
         recorder.write_video(out / f"{trial.part}.mp4")
     recorder.plot(out / f"{trial.part}.png", f"{trial.part}, {trial.method}, seed {trial.seed}")

@@ -2,6 +2,7 @@
 
     python -m experiments.laydown grid --out experiments/results --jobs 1
     python -m experiments.laydown runs --out out/laydown --draws 4 --seed 0 --jobs 1
+    python -m experiments.laydown sample --data out/laydown --out experiments/data/obstacle_course --draws 3
 
 ``grid`` lays one straight bead with a fan on a plane at several cell sizes, with both solvers and both
 inlets, and compares each with the finest of its inlet. It writes laydown_grid.json, .csv, .md and .png.
@@ -9,6 +10,8 @@ inlets, and compares each with the finest of its inlet. It writes laydown_grid.j
 ``runs`` draws paths around 25 centre paths and 12 unseen ones on an obstacle course (Berg 3.2.2), ``--draws``
 around each, one around each before the next. It writes <centre path>.npz: what the surrogate is told and
 what it has to predict, by section; and laydown_runs.json, .csv, .md. Both go on where they were stopped.
+
+``sample`` copies the obstacle course's first ``--draws`` out of ``--data``; sample.json says what.
 """
 
 import argparse
@@ -25,6 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 from agents import engines
+from agents.provenance import commit
 from experiments import command, laydown_data, laydown_figures, results
 from seal_gym.sealant.laydown import foam, sections
 from seal_gym.sealant.laydown.config import SOLVERS, THESIS_FLOW_M3S, GridCfg, LaydownCfg, TcpPath
@@ -257,6 +261,21 @@ def runs(options: argparse.Namespace) -> str:
     return text
 
 
+def sample(options: argparse.Namespace) -> str:
+    """Copies the obstacle course.
+
+    Args:
+        options: With ``data``, ``out``, ``draws``.
+
+    Returns:
+        The table of what was copied.
+    """
+    rows = laydown_data.sample(options.data, options.out, options.draws)
+    about = {"name": "laydown_sample", "command": results.command(NAME), "git_commit": commit(), "rows": rows}
+    (options.out / "sample.json").write_text(results.document_text(about), encoding="utf-8")
+    return results.grid(list(rows[0]), [[str(v) for v in r.values()] for r in rows])
+
+
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Reads the command line.
 
@@ -269,11 +288,19 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m experiments.laydown", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("what", choices=("grid", "runs"), help="the grid study or the surrogate's data")
+    parser.add_argument(
+        "what",
+        choices=("grid", "runs", "sample"),
+        help="the grid study, the surrogate's data, a part of them",
+    )
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="simulations at a time (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the drawn paths (default: %(default)s)")
-    parser.add_argument("--draws", type=int, default=4, help="runs: of each path (default: %(default)s)")
+    parser.add_argument(
+        "--draws", type=int, default=4, help="runs, sample: of each path (default: %(default)s)"
+    )
+    default = Path("out") / NAME
+    parser.add_argument("--data", type=Path, default=default, help="sample: of runs (default: %(default)s)")
     parser.add_argument(
         "--finest", type=float, default=0.5, help="grid: smallest cell [mm] (default: %(default)s)"
     )
@@ -297,6 +324,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
 
     def do() -> str:
+        if options.what == "sample":
+            return sample(options)
         for solver in SOLVERS:
             foam.find(solver)
         return grid(options) if options.what == "grid" else runs(options)

@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.provenance import commit
 from experiments import results
-from seal_gym.core.errors import SealGymError
+from seal_gym.core.errors import SealGymError, require
 from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown import paths, sections
 from seal_gym.sealant.laydown.config import GridCfg, LaydownCfg
@@ -18,6 +18,7 @@ from seal_gym.sealant.laydown.run import simulate, with_room
 
 ARRAYS = "arrays"
 CENTRE_PATHS = {p.name: p for p in paths.TRAINING + paths.VALIDATION}
+INPUTS = ("arc_m", "linear_mps", "angular_radps", "gravity_mps2", "heights_m")
 MOST_VOLUME_ERROR, MOST_LID = 0.05, 0.5
 _LIMIT_S = 1800.0
 
@@ -156,6 +157,36 @@ def store(path: Path, draw: int, arrays: dict[str, np.ndarray[Any, Any]]) -> Non
     with part.open("wb") as file:
         np.savez_compressed(file, **new)  # type: ignore[arg-type]
     part.replace(path)
+
+
+def sample(data: Path, out: Path, draws: int) -> list[Row]:
+    """Copies what a trained surrogate is judged by: the obstacle course's inputs and sections.
+
+    Args:
+        data: Folder of ``runs``.
+        out: Folder of the copies; must be there.
+        draws: Of each centre path, from the first.
+
+    Returns:
+        Centre path, beads, sections and bytes of each copy.
+
+    Raises:
+        ConfigError: If there is no run of the obstacle course.
+    """
+    rows: list[Row] = []
+    for centre in paths.VALIDATION:
+        file, copy = data / f"{centre.name}.npz", out / f"{centre.name}.npz"
+        if not file.exists():
+            continue
+        with np.load(file, allow_pickle=False) as all_of_it:
+            kept = all_of_it["draw"] < draws
+            arrays = {k: all_of_it[k][kept] for k in ("draw", *INPUTS, "image")}
+        np.savez_compressed(copy, **arrays)
+        beads = len(np.unique(arrays["draw"]))
+        size = copy.stat().st_size
+        rows.append({"path": centre.name, "beads": beads, "sections": int(kept.sum()), "bytes": size})
+    require(bool(rows), f"{data} holds no run of the obstacle course: make some with `laydown runs`")
+    return rows
 
 
 def summary(rows: list[Row]) -> list[Row]:

@@ -36,8 +36,10 @@ _SHOWN_POSES = 5
 class Recorder:
     """Records a run: the tip's path in the part's frame, its error, and frames for a video.
 
+    On the ways from home and back there are pictures only.
+
     Attributes:
-        time_s: Of each frame [s].
+        time_s: Of each frame, since the gun was in its hover [s].
         tip_mm: Tip in the part's frame, one row a frame [mm].
         error_mm: Tip error of each frame [mm].
         s_mm: Arc length of the seam's point nearest the tip in each frame [mm].
@@ -59,6 +61,7 @@ class Recorder:
         self.s_mm: list[float] = []
         self.part_pose: list[Array] = []
         self.desired_mm = np.empty((0, 3))
+        self._seen, self._ended, self._start_s = 0, False, 0.0
 
     def __call__(self, env: SealEnv, info: dict[str, Any]) -> None:
         """Takes one frame.
@@ -68,22 +71,31 @@ class Recorder:
             info: Of the last step.
         """
         core = env.core
-        if not self.time_s:
+        if self._seen == 0:
             seam, stand_off = core.scene.workpiece.seam, core.cfg.cell.process.stand_off_m
             sealed = seam.at(np.linspace(0.0, seam.length, 2000))
             self.desired_mm = 1e3 * (sealed.position + stand_off * sealed.approach)
             self._nominal_s = seam.length / core.cfg.cell.process.speed_m_s
-        part = core.arm.part_pose[0].copy()
-        self.part_pose.append(part)
-        self.time_s.append(core.seconds(0))
-        self.tip_mm.append(1e3 * part[:3, :3].T @ (core.tip.pose[0, :3, 3] - part[:3, 3]))
-        self.error_mm.append(info["tip_error_mm"])
-        self.s_mm.append(1e3 * float(core.progress.s[0]))
-        last = "episode_metrics" in info
-        if self._video and (last or (len(self.time_s) - 1) % SPEED_UP == 0):
+        last = "episode_metrics" in info and not self._ended
+        if not (self._ended or info.get("under_way")):
+            self._record(env, info)
+        if self._video and (last or self._seen % SPEED_UP == 0):
             picture = env.render()
             assert picture is not None
             self.frames.append(self._with_strip(picture))
+        self._seen += 1
+        self._ended = self._ended or last
+
+    def _record(self, env: SealEnv, info: dict[str, Any]) -> None:
+        core = env.core
+        part = core.arm.part_pose[0].copy()
+        self.part_pose.append(part)
+        if not self.time_s:
+            self._start_s = core.seconds(0)
+        self.time_s.append(core.seconds(0) - self._start_s)
+        self.tip_mm.append(1e3 * part[:3, :3].T @ (core.tip.pose[0, :3, 3] - part[:3, 3]))
+        self.error_mm.append(info["tip_error_mm"])
+        self.s_mm.append(1e3 * float(core.progress.s[0]))
 
     def _with_strip(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture with the tip error so far on a logarithmic scale below it."""
@@ -100,11 +112,15 @@ class Recorder:
             cv2.putText(
                 strip, label, (12, row(error) + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, _TEXT, 1, cv2.LINE_AA
             )
-        span = max(1.15 * self._nominal_s, self.time_s[-1])
-        x = left + (right - left) * np.asarray(self.time_s) / span
-        points = np.column_stack((x.round(), [row(e) for e in self.error_mm])).astype(np.int32)
-        cv2.polylines(strip, [points], False, _CURVE, 2, cv2.LINE_AA)
-        text = f"tip error {self.error_mm[-1]:.3f} mm    t = {self.time_s[-1]:.1f} s    {SPEED_UP}x real time"
+        if self.time_s:
+            span = max(1.15 * self._nominal_s, self.time_s[-1])
+            x = left + (right - left) * np.asarray(self.time_s) / span
+            points = np.column_stack((x.round(), [row(e) for e in self.error_mm])).astype(np.int32)
+            cv2.polylines(strip, [points], False, _CURVE, 2, cv2.LINE_AA)
+            text = f"tip error {self.error_mm[-1]:.3f} mm    t = {self.time_s[-1]:.1f} s"
+        if self._ended or not self.time_s:
+            text = "back home" if self._ended else "from home to the seam"
+        text += f"    {SPEED_UP}x real time"
         cv2.putText(strip, text, (left, _STRIP - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
         return np.concatenate((picture, strip))
 

@@ -100,6 +100,31 @@ ABOUT = {
         "Inverse kinematics",
         "How often and how fast closed form and Newton's method find a posture for a pose.",
     ),
+    "palette_paths": (
+        "Ways over palettes",
+        "Palette ways",
+        "Multi-path planning beside straight lines, up-across-down and RRT-Connect, among pegs.",
+    ),
+    "palette": (
+        "Ties pressed home on random palettes",
+        "Palettes",
+        "A scripted policy that is told the targets by the truth or by an observer of one picture.",
+    ),
+    "observer": (
+        "Observers of palettes",
+        "Observers",
+        "The two-layer Hopfield observer beside thresholds and k-NN in changing light and noise.",
+    ),
+    "laydown_grid": (
+        "Grid study of the reference simulation",
+        "Grid study",
+        "One straight bead in OpenFOAM by cell size, solver and inlet.",
+    ),
+    "laydown_runs": (
+        "Reference simulations of beads",
+        "Laydown",
+        "Random paths around 25 centre paths and 12 unseen ones in OpenFOAM: the surrogate's data.",
+    ),
     "tune_edges": (
         "Settings of the edge methods",
         "Edge settings",
@@ -305,7 +330,8 @@ def _section(
 ) -> Section:
     name = _kind(document["name"])
     title, short, about = ABOUT.get(name, (name, name, ""))
-    if document.get("renderer") == "none":
+    seals = any("rmse_mm" in row for row in document["rows"])
+    if seals and document.get("renderer") == "none":
         about += " Features from the true geometry (oracle), without images."
     where = path.parent.as_posix()
     if where != ".":

@@ -19,6 +19,7 @@ import seal_gym
 from agents.engines import Engine
 from agents.provenance import ROOT
 from agents.rollouts import play_once
+from agents.travel import play_from_home
 from experiments import results, shapes
 from seal_gym.core.errors import ConfigError, SeamError
 from seal_gym.core.frames import Array
@@ -278,13 +279,16 @@ def _environment(part: str, control: str, kwargs: str, render_mode: str | None) 
     )
 
 
-def run(trial: Trial, observer: Observer | None = None, render_mode: str | None = None) -> dict[str, Any]:
+def run(
+    trial: Trial, observer: Observer | None = None, render_mode: str | None = None, *, from_home: bool = False
+) -> dict[str, Any]:
     """Runs one trial.
 
     Args:
         trial: What to run.
         observer: Called with the environment and the info after the reset and after each step.
         render_mode: Of the environment, for observers that take pictures.
+        from_home: Whether the arm comes from its home and goes back there.
 
     Returns:
         The trial's row as protocol.md has it, with the episode's metrics.
@@ -294,7 +298,8 @@ def run(trial: Trial, observer: Observer | None = None, render_mode: str | None 
     policy = agents.load_policy(trial.weights or trial.method, env)
     core = env.unwrapped
     assert isinstance(core, SealEnv)
-    metrics = play_once(policy, env, trial.seed, observer and (lambda _, info: observer(core, info)))
+    play = play_from_home if from_home else play_once
+    metrics = play(policy, env, trial.seed, observer and (lambda _, info: observer(core, info)))
     del metrics["return"]  # depends on the reward's weights: no table has it
     return _row(trial, metrics)
 

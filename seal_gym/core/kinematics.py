@@ -21,6 +21,8 @@ DH_SIN_ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0])
 JOINT_LOWER = np.array([-2.0, -2.0, -1.0, -2.0, -2.0, -2.0]) * np.pi
 JOINT_UPPER = -JOINT_LOWER
 JOINT_SPEED = np.array([3.15, 3.15, 3.15, 3.2, 3.2, 3.2])
+HOME_Q = np.radians([-15.0, -90.0, -80.0, -100.0, 90.0, -60.0])
+"""The arm's posture of rest: the gun upright, some 0.3 m above the table's middle [rad]."""
 JOINT_TORQUE = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0])
 
 # Nozzle mouth on the tool flange's z axis; the tip's z points back along the nozzle.

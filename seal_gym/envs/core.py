@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from seal_gym.core.errors import ActionError, ConfigError
 from seal_gym.core.frames import Array, axis_angle, cross, tip_rotation, transform, yaw_pose
-from seal_gym.core.kinematics import TipKinematics, tip_kinematics
+from seal_gym.core.kinematics import HOME_Q, TipKinematics, tip_kinematics
 from seal_gym.envs.adapters import ArmState, LeafFunction, RmpAdapter, check_leaf_function, make_adapter
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.extrusion import ROWS as SEALANT_ROWS
 from seal_gym.envs.extrusion import Extrusion
+from seal_gym.envs.journey import Journey
 from seal_gym.envs.sensors import Sensors
 from seal_gym.estimation.seam_rate import SeamRate
 from seal_gym.planning import ik
@@ -100,6 +101,7 @@ class SealCore:
         arm: The physics.
         lines: The seam's line in each view, as perception found it last.
         frames: Frames since each simulation's reset, shape (N,).
+        journey: Guns that started at home.
         action_size: Of an action.
         extrusion: Guns and beads; None without sealant.
     """
@@ -141,6 +143,7 @@ class SealCore:
         self._action = np.zeros((n, self.action_size))
         self._lean = np.zeros(n)
         self.frames = np.zeros(n, np.int64)
+        self.journey = Journey(n)
         start = self._seam.at(0.0)
         self._start = transform(
             tip_rotation(start.tangent, start.approach),
@@ -155,7 +158,9 @@ class SealCore:
                 self.extrusion.watch(self.sensors.nozzle[1])
         self._lean_taught = float(np.arctan2(self._start[2, 0], self._start[2, 2]))
         nominal_s = self._seam.length / cell.process.speed_m_s
-        self.time_limit = int(np.ceil(task.time_factor * nominal_s * cell.timing.frame_rate_hz))
+        rate = cell.timing.frame_rate_hz
+        self.time_limit = int(np.ceil(task.time_factor * nominal_s * rate))
+        self._journey_limit = int(np.ceil(task.journey_s * rate))
 
     def _eyes(self) -> Perception:
         cfg, width = self.cfg, self.scene.workpiece.groove_width
@@ -190,18 +195,22 @@ class SealCore:
 
     # -- running ----------------------------------------------------------------------------------------
 
-    def reset(self, i: int, rng: np.random.Generator) -> None:
-        """Starts a new episode in one simulation: displaces the part, puts the gun in its hover.
+    def reset(self, i: int, rng: np.random.Generator, start: str = "hover") -> None:
+        """Starts a new episode in one simulation: displaces the part, puts the gun in its hover or at home.
 
         Args:
             i: Which simulation.
             rng: Draws pose, start and look, always in the same order.
+            start: ``"hover"``, or ``"home"``: the same hover is where the gun then has to go first.
         """
         task = self.cfg.task
         shift = rng.uniform(-task.part_shift_m, task.part_shift_m, 2)
         yaw = rng.uniform(-task.part_yaw_rad, task.part_yaw_rad)
         part_pose = self._reach.part_pose @ yaw_pose(shift[0], shift[1], 0.0, yaw)
         hovering = self._hover(i, part_pose, rng)
+        self.journey.reset(i, part_pose @ hovering, hovering[:3, 3], start)
+        if start == "home":
+            self._go_home(i, part_pose)
         row = tip_kinematics(self.arm.q[i : i + 1], self.arm.qd[i : i + 1])
         for values, new in zip(self.tip, row, strict=True):
             values[i] = new[0]
@@ -234,6 +243,14 @@ class SealCore:
             f"no start in {_MAX_DRAWS} draws is free of contact and within the arm's reach: begin the seam "
             "where there is more room, or reduce SealTaskCfg's hover_m, sideways_m or turned_rad"
         )
+
+    def _go_home(self, i: int, part_pose: Array) -> None:
+        self.arm.reset(i, HOME_Q, part_pose)
+        if touching := self.arm.contacts(i):
+            raise ConfigError(
+                f"start = 'home': {' and '.join(touching[0])} touch there: this part is in the way of the "
+                "arm's posture of rest; use start='hover'"
+            )
 
     def _draw_hover(self, rng: np.random.Generator) -> Array:
         """``T_part_tip`` of a start from which both ROIs see the seam, drawn until one does.
@@ -274,10 +291,13 @@ class SealCore:
         self.frames += 1
         self._track(qdd)
         before, error = self.progress.furthest, self.progress.error_m.copy()
-        self.progress.advance(self.tip_in_part(), self._seam_speed())
+        tip = self._on_the_seam()
+        self.progress.advance(tip, self._seam_speed())
         if self.extrusion is not None:
             turn = np.swapaxes(self.arm.part_pose[:, :3, :3], 1, 2) @ self.tip.pose[:, :3, :3]
-            self.extrusion.step(delayed[:, -1], self.tip_in_part(), turn, self.progress.s)
+            # The valve is locked until the gun is there.
+            pressure = np.where(self.journey.under_way, -1.0, delayed[:, -1])
+            self.extrusion.step(pressure, tip, turn, self.progress.s)
         return self._judge(touched, action, before, error)
 
     def observe(self, rows: NDArray[np.bool_] | None = None) -> Observation:
@@ -334,6 +354,15 @@ class SealCore:
         offset = self.tip.pose[:, :3, 3] - part[:, :3, 3]
         return np.ascontiguousarray((offset[:, None] @ part[:, :3, :3])[:, 0])
 
+    def _on_the_seam(self) -> Array:
+        """The tips in the parts' frames; of guns on their way from home, where they are expected."""
+        tip = self.tip_in_part()
+        if not self.journey.under_way.any():
+            return tip
+        for i in self.journey.arrive(self.tip.pose):
+            self.progress.reset(i, tip[i])
+        return self.journey.held(tip)
+
     def _seam_speed(self) -> Array | None:
         """True speed of the seam's point nearest the tip a frame ago, shape (N,), m/s; None at rest."""
         twist = self.part_twist
@@ -348,7 +377,8 @@ class SealCore:
         cell, progress = self.cfg.cell, self.progress
         reached = progress.reached & ~touched
         lost = progress.lost & ~touched
-        timeout = (self.frames >= self.time_limit) & ~(touched | reached | lost)
+        limit = self.time_limit + np.where(self.journey.from_home, self._journey_limit, 0)
+        timeout = (self.frames >= limit) & ~(touched | reached | lost)
         change = 0.5 * np.abs(action - self._action).mean(axis=1)
         self._action = action
         value = reward(
@@ -385,7 +415,11 @@ class SealCore:
         return self._disturbances.images(self._exposed(), self.frames)
 
     def _perceive(self, rows: NDArray[np.bool_] | None = None) -> None:
+        looking = ~self.journey.under_way
+        if not looking.all():
+            rows = looking if rows is None else rows & looking
         self.lines = self._seam_lines(rows)
+        self.lines.valid[~looking] = False
         update_features(self.features, self.lines, self._views)
         self._rate.update(
             self.features.point_m,
@@ -500,7 +534,10 @@ class SealCore:
         Returns:
             Seconds since its reset.
         """
-        return float(self.frames[i] * self.cfg.cell.timing.frame_s)
+        return self._seconds(self.frames[i])
+
+    def _seconds(self, frames: np.int64) -> float:
+        return float(frames * self.cfg.cell.timing.frame_s)
 
     def episode_metrics(self, i: int, result: StepResult) -> dict[str, Any]:
         """Summary of an episode that has ended.
@@ -523,6 +560,7 @@ class SealCore:
             "timeout": outcome in ("timeout", "lost"),
             **metrics,
             "time_s": self.seconds(i),
+            **({"journey_s": self._seconds(self.journey.frames[i])} if self.journey.from_home[i] else {}),
             **({} if self.extrusion is None else self.extrusion.metrics(i)),
         }
 
@@ -549,6 +587,9 @@ class SealCore:
             "seam_velocity": self._rate.twist[i].copy(),
             "roi": roi_info(f, i),
         }
+        if self.journey.from_home[i]:
+            info["under_way"] = bool(self.journey.under_way[i])
+            info["hover_pose"] = self.journey.hover[i].copy()
         if self.snr_db is not None:
             info["snr_db"] = self.snr_db[i].copy()
         if self.cfg.disturbances:

@@ -17,6 +17,7 @@ from seal_gym.core.errors import ConfigError
 from seal_gym.envs.adapters import LeafFunction
 from seal_gym.envs.config import SealCfg, check_num_envs
 from seal_gym.envs.core import Observation, SealCore
+from seal_gym.envs.journey import check_start
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.envs.viewing import SceneView, check_render_mode
 
@@ -59,21 +60,23 @@ class SealSb3VecEnv(VecEnv):
     # -- running ----------------------------------------------------------------------------------------
 
     def reset(self) -> VecEnvObs:
-        """Starts an episode in every row, with the seeds given to ``seed``.
+        """Starts an episode in every row, with the seeds given to ``seed`` and the ``set_options``.
+
+        ``{"start": "home"}`` begins at the arm's posture of rest, see ``SealEnv``.
 
         Returns:
             Observations.
 
         Raises:
-            ConfigError: If options were set.
+            ConfigError: If an option is unknown.
         """
-        if any(self._options):
-            raise ConfigError(f"options = {self._options!r}: reset takes none in this version")
+        starts = [check_start(options) for options in self._options]
         for i, seed in enumerate(self._seeds):
             if seed is not None:
                 self._rngs[i], _ = seeding.np_random(seed)
-            self._restart(i)
+            self._restart(i, starts[i])
         self._reset_seeds()
+        self._reset_options()
         self._running = True
         observation = self.core.observe()
         self.reset_infos = [self.core.info(i, None) for i in range(self.num_envs)]
@@ -130,13 +133,13 @@ class SealSb3VecEnv(VecEnv):
             self.reset_infos[i] = self.core.info(i, None)
         return observation
 
-    def _restart(self, i: int) -> None:
+    def _restart(self, i: int, start: str = "hover") -> None:
         rng = self._rngs[i]
         if rng is None:
             rng, _ = seeding.np_random()
             self._rngs[i] = rng
         self._returns[i] = 0.0
-        self.core.reset(i, rng)
+        self.core.reset(i, rng, start)
 
     # -- pictures ---------------------------------------------------------------------------------------
 

@@ -7,10 +7,10 @@ import numpy as np
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
-from seal_gym.core.errors import ConfigError
 from seal_gym.envs.adapters import LeafFunction
 from seal_gym.envs.config import SealCfg
 from seal_gym.envs.core import Observation, SealCore, StepResult, as_action
+from seal_gym.envs.journey import check_start
 from seal_gym.envs.viewing import SceneView, check_render_mode
 
 
@@ -38,6 +38,10 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     the stand-off and to follow the seam at 10 mm/s to its end. Source: Zhou et al., "Neural reactive path
     planning with Riemannian motion policies for robotic sealing", sections 2 and 4; geometry, outcomes and
     metrics as in the benchmark protocol (docs in README.md).
+
+    ``reset(options={"start": "home"})`` begins with the arm at rest (``kinematics.HOME_Q``) above the table,
+    the same hover ahead: the info's ``hover_pose`` says where. Until the gun has been there (3 mm, 3 deg)
+    neither view is valid, no error counts and the sealant's valve stays shut; the time limit is 10 s longer.
 
     The tip frame has its origin at the nozzle mouth, x to the right of travel, y along travel, z back along
     the nozzle. One step is one camera frame, 1/30 s.
@@ -115,6 +119,7 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
     at an episode's end ``episode_metrics``: ``outcome``, ``reached``, ``collision``, ``timeout`` (lost
     included), ``rmse_mm`` (None before 10 mm of travel), ``rmse_whole_mm``, ``coverage_pct``, ``time_s``,
     and on moving parts ``seam_speed_mm_s``. Errors are those against the seam where it is at that instant.
+    Started at home also ``under_way``, ``hover_pose`` (``T_base_tip``, m) and, in the metrics, ``journey_s``.
     With sealant ``sealant`` (``Extrusion.info``), and in ``episode_metrics`` the bead's (``Bead.metrics``).
 
     ## Arguments
@@ -156,18 +161,17 @@ class SealEnv(gym.Env[Any, NDArray[np.float32]], EzPickle):
 
         Args:
             seed: Seeds ``np_random``; without one the generator goes on.
-            options: None are defined.
+            options: ``{"start": "home"}`` begins at the arm's posture of rest instead of the hover, which
+                ``info["hover_pose"]`` then names.
 
         Returns:
             Observation and info.
 
         Raises:
-            ConfigError: If an option is given.
+            ConfigError: If there is no such option or start, or the part is in the posture of rest's way.
         """
         super().reset(seed=seed)
-        if options:
-            raise ConfigError(f"options = {options!r}: reset takes none in this version")
-        self.core.reset(0, self.np_random)
+        self.core.reset(0, self.np_random, check_start(options))
         observation = first(self.core.observe())
         self._running, self._ended = True, False
         self._show()

@@ -15,6 +15,7 @@ from seal_gym.core.frames import Array
 from seal_gym.envs.adapters import LeafFunction
 from seal_gym.envs.config import SealCfg, check_num_envs
 from seal_gym.envs.core import Observation, SealCore, StepResult
+from seal_gym.envs.journey import check_start
 from seal_gym.envs.seal_env import SealEnv
 from seal_gym.envs.viewing import SceneView, check_render_mode
 from seal_gym.vision.features import RoiFeatures
@@ -103,7 +104,9 @@ class SealVectorEnv(VectorEnv, EzPickle):
         Args:
             seed: Row i is seeded with seed + i, or with the list's entry i; rows without one go on with their
                 generator.
-            options: ``{"reset_mask": mask}`` resets the rows of a boolean array of shape (num_envs,) only.
+            options: ``{"reset_mask": mask}`` resets the rows of a boolean array of shape (num_envs,) only;
+                ``{"start": "home"}`` begins at the arm's posture of rest, see ``SealEnv``; episodes that
+                start by themselves begin in the hover.
 
         Returns:
             Observations and info; info masks the rows that were reset.
@@ -111,12 +114,16 @@ class SealVectorEnv(VectorEnv, EzPickle):
         Raises:
             ConfigError: If a seed or an option does not fit.
         """
-        rows = self._reset_mask(options)
+        rest = dict(options or {})
+        rows = self._reset_mask(rest.pop("reset_mask", None))
+        if unknown := sorted(set(rest) - {"start"}):
+            raise ConfigError(f"unknown option {unknown}: reset takes ['reset_mask', 'start']")
+        start = check_start(rest)
         seeds = self._seeds(seed)
         for i in np.flatnonzero(rows):
             if seeds[i] is not None:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
-            self._restart(int(i))
+            self._restart(int(i), start)
         self._ended &= ~rows
         self._running |= rows
         observation = self.core.observe(None if rows.all() else rows)
@@ -155,12 +162,12 @@ class SealVectorEnv(VectorEnv, EzPickle):
         self._show()
         return observation, result.reward, terminated, truncated, self._info(None, result)
 
-    def _restart(self, i: int) -> None:
+    def _restart(self, i: int, start: str = "hover") -> None:
         rng = self._rngs[i]
         if rng is None:
             rng, _ = seeding.np_random()
             self._rngs[i] = rng
-        self.core.reset(i, rng)
+        self.core.reset(i, rng, start)
 
     # -- seeds and options ------------------------------------------------------------------------------
 
@@ -178,11 +185,7 @@ class SealVectorEnv(VectorEnv, EzPickle):
         require(len(seed) == n, f"seed has {len(seed)} entries: must be one number or {n}, one a row")
         return [None if s is None else int(s) for s in seed]
 
-    def _reset_mask(self, options: dict[str, Any] | None) -> NDArray[np.bool_]:
-        options = dict(options or {})
-        mask = options.pop("reset_mask", None)
-        if options:
-            raise ConfigError(f"unknown option {sorted(options)}: reset takes ['reset_mask']")
+    def _reset_mask(self, mask: Any) -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, np.bool_)
         require(
@@ -224,6 +227,10 @@ class SealVectorEnv(VectorEnv, EzPickle):
         if core.extrusion is not None:
             values["sealant"] = core.extrusion.infos()
         info = _masked(values, shown)
+        journey = core.journey
+        if (travelled := shown & journey.from_home).any():
+            ways = {"under_way": journey.under_way.copy(), "hover_pose": journey.hover.copy()}
+            info |= _masked(ways, travelled)
         if result is not None:
             for i in np.flatnonzero(self._ended):
                 last = core.info(int(i), result)

@@ -118,7 +118,7 @@ class SceneView:
     def picture(self) -> NDArray[np.uint8]:
         """The nozzle from ahead on its free side; beside it what the cameras saw, and the whole cell.
 
-        The orange trail is the way of the nozzle mouth on the part; with sealant, the bead in its place.
+        The orange trail is the way of the nozzle mouth along the seam; with sealant, the bead in its place.
 
         Returns:
             Shape (720, 1280, 3), RGB.
@@ -228,6 +228,9 @@ class SceneView:
         if core.frames[0] < self._frame:
             self._trail.clear()
         self._frame = int(core.frames[0])
+        ended = core.progress.furthest[0] >= core.scene.workpiece.seam.length
+        if core.journey.under_way[0] or ended:  # nothing is laid on the way there and back
+            return
         part = core.arm.part_pose[0]
         mouth = part[:3, :3].T @ (core.tip.pose[0, :3, 3] - part[:3, 3])
         if not self._trail or np.linalg.norm(mouth - self._trail[-1]) >= _TRAIL_STEP_M:

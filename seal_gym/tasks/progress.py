@@ -24,6 +24,7 @@ class SealTaskCfg:
         cover_m: Distance within which arc counts as covered [m].
         lost_m: Distance from the desired path at which an episode is lost [m].
         time_factor: Time limit as a multiple of the nominal time.
+        journey_s: What is added to it if the gun starts at the arm's home [s].
         settle_m: Arc length from which ``rmse_mm`` counts [m].
         window_m: How far along the arc progress may move in a frame [m].
         part_shift_m: Largest displacement of the part in x and y [m].
@@ -38,6 +39,7 @@ class SealTaskCfg:
     cover_m: float = 1e-3
     lost_m: float = 25e-3
     time_factor: float = 3.0
+    journey_s: float = 10.0
     settle_m: float = 10e-3
     window_m: float = 10e-3
     part_shift_m: float = 20e-3

@@ -165,3 +165,23 @@ def test_a_run_with_openfoam_gives_data():
     middle = slice(15, len(data["image"]) - 10)
     ratio = data["across_area_m2"][middle].mean() / data["ideal_m2"][middle].mean()
     assert ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_sample_is_the_course_s_first_draws(tmp_path):
+    run = Run("box_side", 0, 0, 1.0, "interFoam")
+    arrays = fake_row(run)[ARRAYS] | {"arc_m": np.zeros(3), "area": np.zeros(3)}
+    for key in ("angular_radps", "gravity_mps2", "heights_m"):
+        arrays[key] = np.zeros((3, 3), dtype=np.float32)
+    for draw in range(3):
+        for name in ("box_side", "plane_s"):
+            laydown_data.store(tmp_path / f"{name}.npz", draw, arrays)
+    out = tmp_path / "course"
+    command = ["sample", "--data", str(tmp_path), "--out", str(out), "--draws", "2"]
+    assert experiment.main(command) == 0
+    assert sorted(f.name for f in out.iterdir()) == ["box_side.npz", "sample.json"]
+    (row,) = json.loads((out / "sample.json").read_text())["rows"]
+    assert (row["path"], row["beads"], row["sections"]) == ("box_side", 2, 6)
+    with np.load(out / "box_side.npz") as data:
+        assert data["draw"].tolist() == [0] * 3 + [1] * 3
+        assert set(data) == {"draw", "image", *laydown_data.INPUTS}
+    assert experiment.main(["sample", "--data", str(tmp_path / "no"), "--out", str(out)]) == 2

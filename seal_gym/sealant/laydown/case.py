@@ -99,16 +99,12 @@ def control(grid: GridCfg, end_s: float) -> dict[str, Entry]:
     }
 
 
-def schemes(grid: GridCfg) -> dict[str, Entry]:
+def schemes() -> dict[str, Entry]:
     """``fvSchemes``.
-
-    Args:
-        grid: Solver.
 
     Returns:
         Entries.
     """
-    limited = "limited 0.5"
     return {
         "ddtSchemes": {"default": "Euler"},
         "gradSchemes": {"default": "Gauss linear"},
@@ -118,23 +114,19 @@ def schemes(grid: GridCfg) -> dict[str, Entry]:
             "div(phirb,alpha)": "Gauss linear",
             "div(((rho*nuEff)*dev2(T(grad(U)))))": "Gauss linear",
         },
-        "laplacianSchemes": {"default": f"Gauss linear {limited}"},
+        "laplacianSchemes": {"default": "Gauss linear orthogonal"},
         "interpolationSchemes": {"default": "linear"},
-        "snGradSchemes": {"default": limited},
+        "snGradSchemes": {"default": "orthogonal"},
         "fluxRequired": {"default": "no", "p_rgh": "", "pcorr": "", f"alpha.{FLUID}": ""},
     }
 
 
-def solution(grid: GridCfg, *, skewed: bool) -> dict[str, Entry]:
+def solution() -> dict[str, Entry]:
     """``fvSolution``.
 
     No momentum predictor: the viscous term is some hundred times stiffer than the step. What two pressure
     corrections leave of a predictor's velocity keeps a bead at rest stirring at 0.1 m/s and lets it creep
     outwards for as long as one waits; with six, or without a predictor, it comes to rest.
-
-    Args:
-        grid: Solver.
-        skewed: Whether the mesh follows a smooth substrate.
 
     Returns:
         Entries.
@@ -174,7 +166,7 @@ def solution(grid: GridCfg, *, skewed: bool) -> dict[str, Entry]:
             "momentumPredictor": "no",
             "nOuterCorrectors": 1,
             "nCorrectors": 3,
-            "nNonOrthogonalCorrectors": int(skewed),
+            "nNonOrthogonalCorrectors": 0,
         },
         "relaxationFactors": {"equations": {'".*"': 1}},
     }
@@ -270,7 +262,6 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
     inlet = cfg.grid.inlet
     data = folder / "constant" / "boundaryData" / inlet
     _write_inflow(flow, mesh.faces_of(inlet)[0], data, fractions=inlet == "top")
-    skewed = bool(np.ptp(mesh.substrate.smooth(mesh.points[:, 0], mesh.points[:, 1])) > 0)
     gravity: dict[str, Entry] = {
         "dimensions": "[0 1 -2 0 0 0 0]",
         "value": "({:.9g} {:.9g} {:.9g})".format(*cfg.gravity_mps2),
@@ -280,8 +271,8 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
         "constant/turbulenceProperties": ("dictionary", {"simulationType": "laminar"}),
         "constant/g": ("uniformDimensionedVectorField", gravity),
         "system/controlDict": ("dictionary", control(cfg.grid, end_s)),
-        "system/fvSchemes": ("dictionary", schemes(cfg.grid)),
-        "system/fvSolution": ("dictionary", solution(cfg.grid, skewed=skewed)),
+        "system/fvSchemes": ("dictionary", schemes()),
+        "system/fvSolution": ("dictionary", solution()),
     }
     for path, (cls, entries) in dictionaries.items():
         file = folder / path

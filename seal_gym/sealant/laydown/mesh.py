@@ -1,4 +1,8 @@
-"""A mesh of boxes over a substrate: columns of cells above the carved part, moved by the smooth part."""
+"""A mesh of boxes over a substrate: all cells whose middles lie above it and below a lid that follows it.
+
+Slopes become steps of a cell. A mesh that follows them would be skewed, and there the solvers' explicit part
+of the viscous stress diverges in the first steps: sealant is some hundred times too viscous for it.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +16,7 @@ from seal_gym.sealant.laydown.substrates import Substrate
 
 Indices = NDArray[np.integer[Any]]
 PATCHES = ("top", "sides", "substrate")
+_ABOVE = -2
 
 
 @dataclass(frozen=True)
@@ -19,15 +24,16 @@ class Mesh:
     """A mesh, its faces in the order that OpenFOAM asks for.
 
     Attributes:
-        origin: Lowest corner before the vertical shift, shape (3,) [m].
+        origin: Lowest corner, shape (3,) [m].
         cell_m: Edge of a cell [m].
-        cell_ids: Number of each cell, -1 where the part is, shape (nx, ny, nz).
+        cell_ids: Number of each cell, -1 where the part is, -2 above the lid, shape (nx, ny, nz).
         points: Shape (p, 3) [m].
         faces: Their points, shape (f, 4): internal faces, then those of each patch.
         owner: Shape (f,).
         neighbour: Of internal faces.
         patches: First face and number of faces of each of ``PATCHES``.
         substrate: What the cells stand on.
+        lid_m: Height of the lid over the smooth part [m].
     """
 
     origin: Array
@@ -39,6 +45,7 @@ class Mesh:
     neighbour: Indices
     patches: dict[str, tuple[int, int]]
     substrate: Substrate
+    lid_m: float
 
     def faces_of(self, patch: str) -> tuple[Array, Array]:
         """The faces of a patch.
@@ -54,8 +61,17 @@ class Mesh:
         area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         return corners.mean(1), area
 
+    def lid_cells(self) -> Indices:
+        """The cells under the lid.
+
+        Returns:
+            Shape (n,).
+        """
+        first, count = self.patches["top"]
+        return np.asarray(self.owner[first : first + count])
+
     def top(self, x: Array, y: Array) -> Array:
-        """The mesh's top.
+        """The lid before it is made of steps.
 
         Args:
             x: Shape (...) [m].
@@ -64,8 +80,7 @@ class Mesh:
         Returns:
             z, shape (...) [m].
         """
-        flat = self.origin[2] + self.cell_ids.shape[2] * self.cell_m
-        return np.asarray(flat + self.substrate.smooth(x, y))
+        return np.asarray(self.lid_m + self.substrate.smooth(x, y))
 
     def cells_at(self, points: Array) -> Indices:
         """Which cells hold some points.
@@ -76,13 +91,11 @@ class Mesh:
         Returns:
             Shape (...), -1 in the part and outside.
         """
-        x, y, z = np.moveaxis(points, -1, 0)
-        local = np.stack((x, y, z - self.substrate.smooth(x, y)), -1)
-        index = np.floor((local - self.origin) / self.cell_m).astype(int)
+        index = np.floor((points - self.origin) / self.cell_m).astype(int)
         shape = np.array(self.cell_ids.shape)
         inside = ((index >= 0) & (index < shape)).all(-1)
         i, j, k = np.moveaxis(np.clip(index, 0, shape - 1), -1, 0)
-        return np.where(inside, self.cell_ids[i, j, k], -1)
+        return np.where(inside, np.maximum(self.cell_ids[i, j, k], -1), -1)
 
 
 def _all_faces(cell_ids: Indices) -> tuple[Indices, Indices, Indices, Indices]:
@@ -119,6 +132,7 @@ def _all_faces(cell_ids: Indices) -> tuple[Indices, Indices, Indices, Indices]:
                 wall[tuple(ends)] = 1
             elif end:
                 wall[tuple(ends)] = 0
+        wall[(below == _ABOVE) | (above == _ABOVE)] = 0
         quads.append(np.stack(corner, -1).reshape(-1, 4))
         lows.append(below.reshape(-1))
         highs.append(above.reshape(-1))
@@ -147,17 +161,20 @@ def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cel
     i0, i1 = np.floor(np.asarray(low) / cell_m + 1e-9), np.ceil(np.asarray(high) / cell_m - 1e-9)
     nx, ny = (i1 - i0).astype(int)
     x, y = ((i0[a] + np.arange(n + 1)) * cell_m for a, n in enumerate((nx, ny)))
-    carved = substrate.carved(*np.meshgrid(x[:-1] + 0.5 * cell_m, y[:-1] + 0.5 * cell_m, indexing="ij"))
-    k0 = np.floor(carved.min() / cell_m + 1e-9)
-    nz = int(np.ceil((carved.max() + clearance_m) / cell_m - 1e-9) - k0)
+    centres = np.meshgrid(x[:-1] + 0.5 * cell_m, y[:-1] + 0.5 * cell_m, indexing="ij")
+    surface, smooth = substrate.height(*centres), substrate.smooth(*centres)
+    lid_m = cell_m * np.ceil((substrate.carved(*centres).max() + clearance_m) / cell_m - 1e-9)
+    k0 = np.floor(surface.min() / cell_m + 1e-9)
+    nz = int(np.ceil((lid_m + smooth.max()) / cell_m - 1e-9) - k0)
     origin = np.array([x[0], y[0], k0 * cell_m])
     middle = origin[2] + (np.arange(nz) + 0.5) * cell_m
-    kept = middle > carved[:, :, None]
-    cell_ids = np.full((nx, ny, nz), -1)
+    above = middle > (lid_m + smooth)[:, :, None]
+    kept = (middle > surface[:, :, None]) & ~above
+    cell_ids = np.where(above, _ABOVE, -1)
     cell_ids[kept] = np.arange(kept.sum())
 
     gx, gy, gz = np.meshgrid(x, y, origin[2] + np.arange(nz + 1) * cell_m, indexing="ij")
-    points = np.stack((gx, gy, gz + substrate.smooth(gx, gy)), -1).reshape(-1, 3)
+    points = np.stack((gx, gy, gz), -1).reshape(-1, 3)
     quad, a, b_, kind = _all_faces(cell_ids)
     inner = (a >= 0) & (b_ >= 0)
     order = np.flatnonzero(inner)[np.lexsort((b_[inner], a[inner]))]
@@ -184,4 +201,5 @@ def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cel
         neighbour,
         patches,
         substrate,
+        float(lid_m),
     )

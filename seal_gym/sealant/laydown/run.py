@@ -94,7 +94,6 @@ def simulate(cfg: LaydownCfg, folder: Path, *, limit_s: float = 3600.0, keep: bo
     cpu_s = foam.run(cfg.grid.solver, folder, limit_s=limit_s)
     cells = int(mesh.cell_ids.max()) + 1
     fractions = foam.read_field(folder / f"{end_s:.9g}" / f"alpha.{case.FLUID}", cells)
-    lid = mesh.cell_ids[:, :, -1]
     if not keep:
         shutil.rmtree(folder)
     return Laydown(
@@ -102,6 +101,6 @@ def simulate(cfg: LaydownCfg, folder: Path, *, limit_s: float = 3600.0, keep: bo
         fractions,
         cfg.path.volume_m3(),
         float(fractions.sum() * mesh.cell_m**3),
-        float(fractions[lid[lid >= 0]].max()),
+        float(fractions[mesh.lid_cells()].max()),
         cpu_s,
     )

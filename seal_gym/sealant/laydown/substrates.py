@@ -1,6 +1,6 @@
 """Named substrates as height fields ``z = carved(x, y) + smooth(x, y)``.
 
-The carved part is piecewise constant and is cut out of the mesh; the smooth part shifts the mesh vertically.
+The carved part is piecewise constant; a mesh's lid follows the smooth part.
 """
 
 from collections.abc import Callable
