@@ -22,6 +22,7 @@ from seal_gym.sealant.laydown.pieces import trace
 from seal_gym.sealant.laydown.sections import COLUMNS, PIXEL_M, Stations, stations
 from seal_gym.sealant.laydown.substrates import SUBSTRATES
 from seal_gym.sealant.strip import Strip
+from seal_gym.sealant.surrogate import load_surrogate
 
 _PIXEL_M = 0.5e-3
 _BLUR_M = 1e-3
@@ -214,19 +215,12 @@ def place_shares(edges: Edges, path: BeadPath, at: Places, fan_angle_rad: float)
     return np.asarray(shares(path)[nearest])
 
 
-def _ballistic(strip: Strip, at: Places, fan_angle_rad: float) -> Evaluator:
-    left, right = place_points(strip, at.left), place_points(strip, at.right)
-    return Ballistic(left=left, right=right, fan_angle_rad=fan_angle_rad)
+EVALUATORS = ("ballistic", "fast", "surrogate")
 
 
-def _fast(strip: Strip, at: Places, fan_angle_rad: float) -> Evaluator:
-    return FastTier(strip=strip, places=at, fan_angle_rad=fan_angle_rad)
-
-
-EVALUATORS: dict[str, Callable[[Strip, Places, float], Evaluator]] = {"ballistic": _ballistic, "fast": _fast}
-
-
-def evaluator(name: str, case: BeadCase, strip: Strip, at: Places, fan_angle_rad: float) -> Evaluator:
+def evaluator(
+    name: str, case: BeadCase, strip: Strip, at: Places, fan_angle_rad: float, weights: str | None = None
+) -> Evaluator:
     """An evaluator for a case.
 
     Args:
@@ -235,16 +229,25 @@ def evaluator(name: str, case: BeadCase, strip: Strip, at: Places, fan_angle_rad
         strip: Under it.
         at: Where heights are wanted.
         fan_angle_rad: theta [rad].
+        weights: The surrogate's file, see ``load_surrogate``.
 
     Returns:
         The evaluator.
 
     Raises:
-        ConfigError: If the case is not in a plane.
+        ConfigError: If the case is not in a plane, or the surrogate has no weights.
+        SurrogateFileError: If they cannot be read.
     """
     require(
         case.name not in bead_laydown.SURFACES,
         f"case {case.name!r}: does not lie in a plane, which the evaluators ask for",
         ConfigError,
     )
-    return EVALUATORS[name](strip, at, fan_angle_rad)
+    if name == "fast":
+        return FastTier(strip=strip, places=at, fan_angle_rad=fan_angle_rad)
+    left, right = place_points(strip, at.left), place_points(strip, at.right)
+    if name == "ballistic":
+        return Ballistic(left=left, right=right, fan_angle_rad=fan_angle_rad)
+    require(weights is not None, "evaluator 'surrogate': needs a file of weights", ConfigError)
+    predict = load_surrogate(str(weights)).predict
+    return Sections(predict=predict, left=left, right=right, fan_angle_rad=fan_angle_rad)

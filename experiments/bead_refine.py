@@ -46,11 +46,13 @@ class Run:
         case: Name.
         evaluator: Of ``bead_evaluators.EVALUATORS``.
         cell_mm: Edge of the reference's cells.
+        weights: The surrogate's file, if it is the evaluator.
     """
 
     case: str
     evaluator: str
     cell_mm: float
+    weights: str | None = None
 
 
 def unevenness(heights: Array, corner: NDArray[np.bool_]) -> Row:
@@ -90,7 +92,7 @@ def work(run: Run) -> Row:
     strip = bead_laydown.strip_of(case, edges)
     at = bead_laydown.places(edges, strip)
     first = bead_reference.paths_of(case, edges, cfg)["ipopt"]
-    evaluate = evaluator(run.evaluator, case, strip, at, theta)
+    evaluate = evaluator(run.evaluator, case, strip, at, theta, run.weights)
     share = place_shares(edges, first, at, theta)
     paths, asked = {PATHS[0]: first}, {PATHS[0]: evaluate([first])[0]}
     truth: dict[str, Array] = {}
@@ -179,6 +181,7 @@ def markdown(rows: list[Row], run: Run) -> str:
     evaluators = {
         "ballistic": "the jet flies with the tip's velocity added and stays where it lands",
         "fast": "the fast tier: straight rays on columns",
+        "surrogate": "the cross-sections that a network predicts",
     }
     about = (
         f"Geometric: the optimal path of bead_paths.md. Refined: on the evaluator ({run.evaluator}: "
@@ -203,7 +206,8 @@ def make(options: argparse.Namespace) -> str:
     Returns:
         The table.
     """
-    wanted = [Run(name, options.evaluator, options.cell) for name in options.case or DEFAULT_CASES]
+    weights = str(options.weights) if options.weights else None
+    wanted = [Run(name, options.evaluator, options.cell, weights) for name in options.case or DEFAULT_CASES]
     folder = options.out / f"{NAME}_fields"
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -245,15 +249,18 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--evaluator",
         default="ballistic",
-        choices=sorted(EVALUATORS),
+        choices=EVALUATORS,
         help="that paths are refined on (default: %(default)s)",
     )
+    parser.add_argument("--weights", type=Path, help="of the surrogate: NAME.safetensors")
     parser.add_argument("--cell", type=float, default=2.0, help="edge of a cell [mm] (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out") / NAME, help="folder (default: %(default)s)")
     options = command.checked(parser, arguments, jobs=1)
     if not 0.25 <= options.cell <= 4.0:
         parser.error(f"--cell {options.cell}: must be in [0.25, 4] mm")
+    if (options.evaluator == "surrogate") != (options.weights is not None):
+        parser.error("--evaluator surrogate needs --weights NAME.safetensors, no other does")
     return options
 
 
