@@ -104,7 +104,11 @@ def told(rows: list[Row]) -> list[tuple[str, Row]]:
     ]
     heights = [r for r in rows if r["input"] not in _WORDS]
     left, right = heights[: len(heights) // 2], heights[len(heights) // 2 + 1 :]
-    for title, chosen in (("all heights", heights), ("heights to the left", left), ("to the right", right)):
+    for title, chosen in (
+        ("all heights", heights),
+        ("heights to the left", left),
+        ("heights to the right", right),
+    ):
         mean = 1e3 * float(np.mean([r["one_sd"] for r in chosen]))
         total = {k: sum(r[k] for r in chosen) for k in _EFFECTS}
         named.append((f"{title} (+{mean:.1f} mm)", total))
@@ -145,8 +149,13 @@ def text(found: list[Judged], compared: list[Row], glass: list[Row], data: Row) 
     missing = ", ".join(data["missing"])
     lines = [
         f"Obstacle course: {data['course'][0]} beads around {data['course'][1]} of {len(VALIDATION)} unseen "
-        f"centre paths; learned from {data['train'][0]} beads around {data['train'][1]} of {len(TRAINING)}, "
-        f"{data['held'][0]} beads around {data['held'][1]} more held out to stop and choose by."
+        "centre paths; "
+        + (
+            f"learned from {data['train'][0]} beads around {data['train'][1]} of {len(TRAINING)}, "
+            f"{data['held'][0]} beads around {data['held'][1]} more held out to stop and choose by."
+            if data["train"][0]
+            else "weights of an earlier training."
+        )
         + (f" Without data, and so left out: {missing}." if missing else ""),
         "",
         "Means over beads with bootstrap 95 % intervals over beads (draws around one centre path share its "

@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
+from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from skimage.measure import find_contours
 
 from agents.surrogate_data import Bead
 from experiments import results
@@ -30,8 +30,8 @@ Row = dict[str, Any]
 
 def _contour(image: Array) -> Array:
     """Points of the half-full line, shape (n, 2), in pixels."""
-    lines = find_contours(np.pad(image, 1), 0.5)  # type: ignore[no-untyped-call]
-    return np.concatenate(lines) if lines else np.zeros((0, 2))
+    lines = contour_generator(z=np.pad(image, 1)).lines(0.5)
+    return np.concatenate([np.asarray(line) for line in lines]) if lines else np.zeros((0, 2))
 
 
 def contour_distance_m(one: Array, two: Array) -> float | None:
