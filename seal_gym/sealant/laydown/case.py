@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown import foam, jet
@@ -34,8 +36,14 @@ def build_mesh(cfg: LaydownCfg) -> Mesh:
     if grid.inlet == "top":
         lid = jet.landings(cfg, lambda x, y: part.height(x, y) + grid.clearance_m)[2]
         place = np.vstack((place, lid[:, :2]))
+    landings, margin = cKDTree(place), grid.margin_m
+
+    def near(x: Array, y: Array) -> NDArray[np.bool_]:
+        away, _ = landings.query(np.stack((x, y), -1), distance_upper_bound=margin)
+        return np.asarray(np.isfinite(away))
+
     return meshes.build(
-        part, place.min(0) - grid.margin_m, place.max(0) + grid.margin_m, grid.clearance_m, grid.cell_m
+        part, place.min(0) - margin, place.max(0) + margin, grid.clearance_m, grid.cell_m, near
     )
 
 

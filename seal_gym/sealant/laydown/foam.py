@@ -161,4 +161,5 @@ def run(program: str, case: Path, *, limit_s: float) -> float:
         tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
         raise LaydownError(f"{program} ended with status {status}, its last lines (all in {log}):\n{tail}")
     after = os.times()
-    return after.children_user + after.children_system - before.children_user - before.children_system
+    took = after.children_user + after.children_system - before.children_user - before.children_system
+    return max(took, 0.0)  # differences of large sums may round below

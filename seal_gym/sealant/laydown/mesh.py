@@ -4,6 +4,7 @@ Slopes become steps of a cell. A mesh that follows them would be skewed, and the
 of the viscous stress diverges in the first steps: sealant is some hundred times too viscous for it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,9 @@ from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown.substrates import Substrate
 
 Indices = NDArray[np.integer[Any]]
+Near = Callable[[Array, Array], NDArray[np.bool_]]
 PATCHES = ("top", "sides", "substrate")
-_ABOVE = -2
+_ABOVE, _ASIDE = -2, -3
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Mesh:
     Attributes:
         origin: Lowest corner, shape (3,) [m].
         cell_m: Edge of a cell [m].
-        cell_ids: Number of each cell, -1 where the part is, -2 above the lid, shape (nx, ny, nz).
+        cell_ids: Number of each cell, -1 where the part is, -2 above the lid, -3 aside, shape (nx, ny, nz).
         points: Shape (p, 3) [m].
         faces: Their points, shape (f, 4): internal faces, then those of each patch.
         owner: Shape (f,).
@@ -133,6 +135,7 @@ def _all_faces(cell_ids: Indices) -> tuple[Indices, Indices, Indices, Indices]:
             elif end:
                 wall[tuple(ends)] = 0
         wall[(below == _ABOVE) | (above == _ABOVE)] = 0
+        wall[(below == _ASIDE) | (above == _ASIDE)] = 1
         quads.append(np.stack(corner, -1).reshape(-1, 4))
         lows.append(below.reshape(-1))
         highs.append(above.reshape(-1))
@@ -141,7 +144,9 @@ def _all_faces(cell_ids: Indices) -> tuple[Indices, Indices, Indices, Indices]:
     return quad, low, high, kind
 
 
-def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cell_m: float) -> Mesh:
+def build(
+    substrate: Substrate, low: Array, high: Array, clearance_m: float, cell_m: float, near: Near | None = None
+) -> Mesh:
     """Meshes the room above a substrate.
 
     Args:
@@ -150,6 +155,7 @@ def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cel
         high: Largest.
         clearance_m: Height above the carved part's highest place [m].
         cell_m: Edge of a cell [m].
+        near: Which columns of cells are wanted, by (x, y) of their middles [m]; all by default.
 
     Returns:
         The mesh; its edges are whole multiples of ``cell_m``.
@@ -169,8 +175,9 @@ def build(substrate: Substrate, low: Array, high: Array, clearance_m: float, cel
     origin = np.array([x[0], y[0], k0 * cell_m])
     middle = origin[2] + (np.arange(nz) + 0.5) * cell_m
     above = middle > (lid_m + smooth)[:, :, None]
-    kept = (middle > surface[:, :, None]) & ~above
-    cell_ids = np.where(above, _ABOVE, -1)
+    aside = np.zeros(surface.shape, np.bool_) if near is None else ~near(*centres)
+    kept = (middle > surface[:, :, None]) & ~above & ~aside[:, :, None]
+    cell_ids = np.where(aside[:, :, None], _ASIDE, np.where(above, _ABOVE, -1))
     cell_ids[kept] = np.arange(kept.sum())
 
     gx, gy, gz = np.meshgrid(x, y, origin[2] + np.arange(nz + 1) * cell_m, indexing="ij")
