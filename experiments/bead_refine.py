@@ -128,6 +128,18 @@ def work(run: Run) -> Row:
     return {"rows": rows, ARRAYS: arrays}
 
 
+def title(evaluator_name: str) -> str:
+    """What the files of an evaluator's results are called.
+
+    Args:
+        evaluator_name: Of ``bead_evaluators.EVALUATORS``.
+
+    Returns:
+        Their name; the default evaluator's have the experiment's own.
+    """
+    return NAME if evaluator_name == EVALUATORS[0] else f"{NAME}_{evaluator_name}"
+
+
 def markdown(rows: list[Row], run: Run) -> str:
     """The table for people.
 
@@ -193,7 +205,9 @@ def markdown(rows: list[Row], run: Run) -> str:
         "edges; mean difference at the corners: all in the reference. Corrections: the largest of each; "
         "evaluations: paths that the evaluator was asked about."
     )
-    pictures = [f"![{name}]({NAME}_{name}.png)" for name in dict.fromkeys(row["case"] for row in rows)]
+    pictures = [
+        f"![{name}]({title(run.evaluator)}_{name}.png)" for name in dict.fromkeys(row["case"] for row in rows)
+    ]
     return "\n\n".join((table, about, *pictures))
 
 
@@ -222,9 +236,15 @@ def make(options: argparse.Namespace) -> str:
                 {"case": run.case, "evaluator": run.evaluator, "cell_mm": run.cell_mm, **row, "gain": gain}
             )
         with np.load(file) as stored:
-            draw(options.out / f"{NAME}_{run.case}.png", bead_cases.get(run.case), PATHS, dict(stored))
+            draw(
+                options.out / f"{title(run.evaluator)}_{run.case}.png",
+                bead_cases.get(run.case),
+                PATHS,
+                dict(stored),
+            )
     text = markdown(rows, wanted[0])
-    results.write(options.out, NAME, rows, [], renderer="none", regime="static", text=text)
+    name = title(options.evaluator)
+    results.write(options.out, name, rows, [], renderer="none", regime="static", text=text, module=NAME)
     return text
 
 
@@ -248,7 +268,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--evaluator",
-        default="ballistic",
+        default=EVALUATORS[0],
         choices=EVALUATORS,
         help="that paths are refined on (default: %(default)s)",
     )

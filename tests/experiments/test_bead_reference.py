@@ -169,6 +169,17 @@ def test_unevenness_by_hand():
     assert row["corner_mm"] == pytest.approx(1.0)
 
 
+def test_a_surrogate_needs_its_weights(straight, capsys):
+    case, _, strip, at, _ = straight
+    with pytest.raises(ConfigError, match="needs a file of weights"):
+        evaluator("surrogate", case, strip, at, THETA)
+    with pytest.raises(SystemExit):
+        bead_refine.parse(["--evaluator", "surrogate"])
+    assert "needs --weights" in capsys.readouterr().err
+    assert bead_refine.title("ballistic") == "bead_refine"
+    assert bead_refine.title("surrogate") == "bead_refine_surrogate"
+
+
 @pytest.mark.parametrize("module", [bead_reference, bead_refine])
 def test_without_openfoam_there_is_a_word(module, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
