@@ -319,7 +319,9 @@ def markdown(rows: list[Row], cell_mm: float) -> str:
         "tier's table (bead_paths.md). Difference at corners: between left and right edge where the "
         "centre line turns at least half as sharply as it does anywhere, mean (largest). Reduction: the "
         "naive mean difference over the optimal one. From the fast tier: root mean square difference of "
-        "the heights at both edges."
+        "the heights at both edges. Over edges (over_corner, stairs) the tip swings round at up to four "
+        "times the bead's speed and the jet carries that along: it leaves the edge thin and heaps up what "
+        "is missing there behind it, or before hollow corners; neither path nor fast tier knows of it."
     )
     sizes = (
         f"Width: mean over the path, where the bead is at least {1e3 * BEAD_M:g} mm high; area: mean, of "
