@@ -339,7 +339,8 @@ class Comparison:
         elif "ipopt" not in rows:
             word = "no path"
         for who in PATHS[1:]:
-            out[f"{who}_reduction"] = None if word else naive / out[f"{who}_laid_corner_mm"]
+            mine = out[f"{who}_laid_corner_mm"]
+            out[f"{who}_reduction"] = None if word or mine is None else naive / mine
         return out | {"reduction_word": word}
 
 

@@ -1,5 +1,6 @@
 """Figures of laid beads: height maps of naive and optimal path, and the heights along both edges."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,19 @@ _DRY_M = 0.05e-3
 _TOP = 1.6  # colours end, and heights leave the picture, above so many times the mean
 _LONG = 1.6  # maps that are wider than this are drawn one above the other
 _NAMES = {"naive": "naive", "ipopt": "optimal"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Beside:
+    """Heights that are drawn dotted beside a bead's own.
+
+    Attributes:
+        heights: By the path they go with.
+        label: What they are.
+    """
+
+    heights: dict[str, EdgeHeights]
+    label: str
 
 
 def _axes(found: Comparison, case: BeadCase) -> tuple[Array, Array, str, str]:
@@ -55,16 +69,16 @@ def _spans(ax: Any, heights: EdgeHeights) -> None:
         ax.axvspan(s[first], s[last - 1], color=_CORNER, lw=0, label=None if k else "corner")
 
 
-def _heights(ax: Any, found: Comparison, who: str, top_mm: float) -> None:
+def _heights(ax: Any, found: Comparison, who: str, top_mm: float, beside: Beside) -> None:
     heights = found.heights[who]
     s = 1e3 * heights.places.along_m
     _spans(ax, heights)
     ax.plot(s, 1e3 * heights.left_m, color=_LEFT, lw=2.6, label="left edge")
     ax.plot(s, 1e3 * heights.right_m, color=_RIGHT, lw=1.4, label="right edge")
-    if who == "ipopt":
-        robot = found.heights["robot"]
-        ax.plot(s, 1e3 * robot.left_m, color="k", lw=1.0, ls=":", label="by the UR5")
-        ax.plot(s, 1e3 * robot.right_m, color="k", lw=1.0, ls=":")
+    if who in beside.heights:
+        other = beside.heights[who]
+        ax.plot(s, 1e3 * other.left_m, color="k", lw=1.0, ls=":", label=beside.label)
+        ax.plot(s, 1e3 * other.right_m, color="k", lw=1.0, ls=":")
     ax.set_ylim(0.0, top_mm)
     ax.set_title(f"{_NAMES[who]}: height inside the edges", fontsize=11)
     ax.set_xlabel("along the centre line [mm]")
@@ -72,7 +86,15 @@ def _heights(ax: Any, found: Comparison, who: str, top_mm: float) -> None:
     ax.grid(alpha=0.3)
 
 
-def draw(file: Path, case: BeadCase, edges: Edges, found: Comparison) -> None:
+def draw(
+    file: Path,
+    case: BeadCase,
+    edges: Edges,
+    found: Comparison,
+    *,
+    title: str = "Bead in the fast tier",
+    beside: Beside | None = None,
+) -> None:
     """Draws the beads of the naive and the optimal path.
 
     Args:
@@ -80,8 +102,13 @@ def draw(file: Path, case: BeadCase, edges: Edges, found: Comparison) -> None:
         case: For the title.
         edges: The edges.
         found: The beads.
+        title: What laid them.
+        beside: Dotted; by default the heights by the UR5, if they are there.
     """
     shown = [who for who in _NAMES if who in found.laid]
+    if beside is None:
+        robot = {"ipopt": found.heights["robot"]} if "robot" in found.heights else {}
+        beside = Beside(heights=robot, label="by the UR5")
     strip, last = found.strip, found.heights[shown[-1]]
     top = 1e3 * _TOP * float(np.mean((last.left_m, last.right_m)))
     ratio = float(np.ptp(strip.arc) / np.ptp(strip.across))
@@ -101,10 +128,10 @@ def draw(file: Path, case: BeadCase, edges: Edges, found: Comparison) -> None:
         image = _map(ax, found, case, edges, who, top)
     upper.colorbar(image, ax=maps, label="height [mm]", extend="max", shrink=0.9)
     for ax, who in zip(lower.subplots(1, len(shown), squeeze=False).ravel(), shown, strict=True):
-        _heights(ax, found, who, top)
+        _heights(ax, found, who, top, beside)
     handles, labels = ax.get_legend_handles_labels()
     lower.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     word = "" if "ipopt" in found.laid else ", no path within the limits"
-    figure.suptitle(f"Bead in the fast tier: {case.title}{word}", fontsize=12)
+    figure.suptitle(f"{title}: {case.title}{word}", fontsize=12)
     figure.savefig(file, dpi=80)
     plt.close(figure)

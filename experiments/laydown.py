@@ -165,10 +165,21 @@ def markdown(rows: list[Row]) -> str:
     )
 
 
-def _resumed(
+def resumed(
     wanted: list[Any], work: Callable[[Any], Row], log: Path, jobs: int, title: str
 ) -> Iterator[tuple[Any, Row, bool]]:
-    """Each unit, its row, whether it was run now; a row is logged when the caller asks for the next."""
+    """Runs what a log does not hold yet.
+
+    Args:
+        wanted: Units of work, frozen dataclasses.
+        work: Runs one.
+        log: Has a line for each unit that was run; a row is logged when the caller asks for the next.
+        jobs: Processes.
+        title: Of the progress bar.
+
+    Yields:
+        Each unit, its row (without ``laydown_data.ARRAYS`` if it is the log's), whether it was run now.
+    """
     text = log.read_text(encoding="utf-8") if log.exists() else ""
     done = {}
     for line in text.splitlines():
@@ -215,7 +226,7 @@ def grid(options: argparse.Namespace) -> str:
     ]
     cases.sort(key=lambda c: -c.cell_mm)  # the cheap ones first
     log = options.out / "laydown_grid.trials.jsonl"
-    found = {c: row for c, row, _ in _resumed(cases, lay, log, options.jobs, "grid")}
+    found = {c: row for c, row, _ in resumed(cases, lay, log, options.jobs, "grid")}
     full = [found[c] for c in sorted(cases, key=lambda c: (c.inlet, c.solver, -c.cell_mm))]
     rows = compared(full)
     text = markdown(rows)
@@ -238,7 +249,7 @@ def runs(options: argparse.Namespace) -> str:
     wanted = laydown_data.plan(options.draws, options.seed, options.cell, options.solver)
     log = options.out / "laydown_runs.trials.jsonl"
     rows = []
-    for run, row, new in _resumed(wanted, laydown_data.simulate_run, log, options.jobs, "runs"):
+    for run, row, new in resumed(wanted, laydown_data.simulate_run, log, options.jobs, "runs"):
         if new and row["error"] is None:
             laydown_data.store(options.out / f"{run.path}.npz", run.draw, row[laydown_data.ARRAYS])
         rows.append({**asdict(run), **{k: v for k, v in row.items() if k != laydown_data.ARRAYS}})

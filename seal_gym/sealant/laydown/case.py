@@ -12,7 +12,6 @@ from seal_gym.sealant.laydown import mesh as meshes
 from seal_gym.sealant.laydown.config import FluidCfg, GridCfg, LaydownCfg
 from seal_gym.sealant.laydown.foam import Entry, dictionary, header
 from seal_gym.sealant.laydown.mesh import Mesh
-from seal_gym.sealant.laydown.substrates import SUBSTRATES
 
 FLUID = "sealant"
 _AIR_VISCOSITY_M2PS = 1.48e-5
@@ -32,7 +31,7 @@ def build_mesh(cfg: LaydownCfg) -> Mesh:
     Raises:
         LaydownError: If a part of the jet does not come down on the substrate.
     """
-    part, grid = SUBSTRATES[cfg.substrate], cfg.grid
+    part, grid = cfg.part, cfg.grid
     place = jet.landings(cfg)[2][:, :2]
     if grid.inlet == "top":
         lid = jet.landings(cfg, lambda x, y: part.height(x, y) + grid.clearance_m)[2]

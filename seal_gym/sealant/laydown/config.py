@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from seal_gym.core.errors import ConfigError, SealGymError, is_number, require
 from seal_gym.core.frames import Array
-from seal_gym.sealant.laydown.substrates import SUBSTRATES
+from seal_gym.sealant.laydown.substrates import SUBSTRATES, Substrate
 from seal_gym.sealant.pneumatics import SEALANTS, Sealant
 
 GRAVITY_MPS2 = 9.81
@@ -191,7 +191,7 @@ class LaydownCfg:
 
     Attributes:
         path: The tip's.
-        substrate: Name, see ``substrates.SUBSTRATES``.
+        substrate: Name, see ``substrates.SUBSTRATES``, or a part of one's own.
         fluid: The sealant.
         nozzle: What throws it.
         grid: Mesh, solver, time step.
@@ -199,7 +199,7 @@ class LaydownCfg:
     """
 
     path: TcpPath
-    substrate: str = "plane"
+    substrate: str | Substrate = "plane"
     fluid: FluidCfg = field(default_factory=FluidCfg)
     nozzle: NozzleCfg = field(default_factory=NozzleCfg)
     grid: GridCfg = field(default_factory=GridCfg)
@@ -207,9 +207,14 @@ class LaydownCfg:
 
     def __post_init__(self) -> None:
         require(
-            self.substrate in SUBSTRATES,
-            f"substrate = {self.substrate!r}: must be one of {', '.join(SUBSTRATES)}",
+            isinstance(self.substrate, Substrate) or self.substrate in SUBSTRATES,
+            f"substrate = {self.substrate!r}: must be a Substrate or one of {', '.join(SUBSTRATES)}",
             ConfigError,
         )
         ok = np.shape(self.gravity_mps2) == (3,) and all(map(is_number, self.gravity_mps2))
         require(ok, f"gravity_mps2 = {self.gravity_mps2!r}: must be three numbers")
+
+    @property
+    def part(self) -> Substrate:
+        """The substrate itself."""
+        return self.substrate if isinstance(self.substrate, Substrate) else SUBSTRATES[self.substrate]

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError
 from seal_gym.sealant.laydown.mesh import Mesh
-from seal_gym.sealant.laydown.substrates import SUBSTRATES, Height
+from seal_gym.sealant.laydown.substrates import Height
 
 _PER_SAMPLE = 4  # emissions in a sample of the inlet
 _RAYS = 120  # across a fan, or over a round jet's section
@@ -130,7 +130,8 @@ def fly(
 
 def _reach_s(cfg: LaydownCfg) -> float:
     """A flight time that brings any useful parcel down: three times the tip's height at the jet's speed."""
-    height = float(np.max(cfg.path.positions[:, 2])) + 0.03
+    x, y, z = cfg.path.positions.T
+    height = float(np.max(z - np.minimum(cfg.part.height(x, y), 0.0))) + 0.03
     return 3.0 * height / cfg.nozzle.jet_speed_mps
 
 
@@ -147,7 +148,7 @@ def landings(cfg: LaydownCfg, surface: Height | None = None) -> tuple[Parcels, A
     Raises:
         LaydownError: If a part of the jet misses the surface.
     """
-    jet, surface = emit(cfg), surface or SUBSTRATES[cfg.substrate].height
+    jet, surface = emit(cfg), surface or cfg.part.height
     gravity = np.asarray(cfg.gravity_mps2)
     t, place, velocity = fly(jet.positions, jet.velocities, gravity, surface, reach_s=_reach_s(cfg))
     if np.isnan(t).any():

@@ -9,7 +9,7 @@ from seal_gym.core.frames import Array, normalise
 from seal_gym.sealant.laydown.config import LaydownCfg, LaydownError
 from seal_gym.sealant.laydown.jet import fly
 from seal_gym.sealant.laydown.mesh import Mesh
-from seal_gym.sealant.laydown.substrates import SUBSTRATES, Substrate
+from seal_gym.sealant.laydown.substrates import Substrate
 
 COLUMNS, ROWS = 40, 20
 PIXEL_M = 1e-3
@@ -69,7 +69,7 @@ def stations(cfg: LaydownCfg) -> Stations:
     Raises:
         LaydownError: If the nozzle points past the substrate.
     """
-    path, part = cfg.path, SUBSTRATES[cfg.substrate]
+    path, part = cfg.path, cfg.part
     knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path.positions, axis=0), axis=1)))
     arcs = np.arange(0.0, knots[-1], _SPACING_M)
     times = np.interp(np.append(arcs, min(arcs[-1] + _SPACING_M, knots[-1])), knots, path.times_s)
