@@ -4,8 +4,8 @@
     python -m experiments.laydown runs --out out/laydown --draws 4 --seed 0 --jobs 1
     python -m experiments.laydown sample --data out/laydown --out experiments/data/obstacle_course --draws 3
 
-``grid`` lays one straight bead with a fan on a plane at several cell sizes, with both solvers and both
-inlets, and compares each with the finest of its inlet. It writes laydown_grid.json, .csv, .md and .png.
+``grid`` lays one straight bead with a fan on a plane at several cell sizes, with both solvers, and compares
+each with the finest. It writes laydown_grid.json, .csv, .md and .png.
 
 ``runs`` draws paths around 25 centre paths and 12 unseen ones on an obstacle course (Berg 3.2.2), ``--draws``
 around each, one around each before the next. It writes <centre path>.npz: what the surrogate is told and
@@ -37,7 +37,7 @@ from seal_gym.sealant.laydown.run import simulate
 NAME = "laydown"
 LENGTH_M, SPEED_MPS, HEIGHT_M = 40e-3, 0.3, 30e-3
 STEADY = slice(12, 30)  # sections [mm], away from the bead's ends
-CELLS_MM = {"substrate": (2.0, 1.0, 0.75, 0.5), "top": (2.0, 1.0)}
+CELLS_MM = (2.0, 1.0, 0.75, 0.5)
 _LIMIT_S = 7200.0
 
 Row = dict[str, Any]
@@ -48,12 +48,10 @@ class Case:
     """One simulation of the grid study.
 
     Attributes:
-        inlet: See ``GridCfg``.
         solver: OpenFOAM's.
         cell_mm: Edge of a cell.
     """
 
-    inlet: str
     solver: str
     cell_mm: float
 
@@ -73,7 +71,7 @@ def bead(case: Case) -> LaydownCfg:
         rotations=np.repeat(np.eye(3)[None], 2, 0),
         flows_m3s=np.full(2, THESIS_FLOW_M3S),
     )
-    grid = GridCfg(cell_m=1e-3 * case.cell_mm, solver=case.solver, inlet=case.inlet)  # type: ignore[arg-type]
+    grid = GridCfg(cell_m=1e-3 * case.cell_mm, solver=case.solver)  # type: ignore[arg-type]
     return LaydownCfg(path=path, grid=grid)
 
 
@@ -108,19 +106,18 @@ def lay(case: Case) -> Row:
 
 
 def compared(rows: list[Row]) -> list[Row]:
-    """Adds the intersection over union with the finest bead of the same inlet and solver, and across solvers.
+    """Adds the intersection over union with the finest bead of the same solver, and across solvers.
 
     Args:
         rows: From ``lay``.
 
     Returns:
-        Rows without sections, with ``iou_finest`` and ``iou_solvers`` (same cell and inlet, other solver).
+        Rows without sections, with ``iou_finest`` and ``iou_solvers`` (same cell, other solver).
     """
     out = []
     for row in rows:
-        alike = [r for r in rows if r["inlet"] == row["inlet"]]
-        finest = min((r for r in alike if r["solver"] == row["solver"]), key=lambda r: float(r["cell_mm"]))
-        other = [r for r in alike if r["cell_mm"] == row["cell_mm"] and r["solver"] != row["solver"]]
+        finest = min((r for r in rows if r["solver"] == row["solver"]), key=lambda r: float(r["cell_mm"]))
+        other = [r for r in rows if r["cell_mm"] == row["cell_mm"] and r["solver"] != row["solver"]]
         mine = np.array(row["section"])
         kept = {k: v for k, v in row.items() if k != "section"}
         kept["iou_finest"] = float(sections.iou(mine, np.array(finest["section"])))
@@ -138,11 +135,10 @@ def markdown(rows: list[Row]) -> str:
     Returns:
         Markdown.
     """
-    head = ["inlet", "solver", "cell mm", "area mm²", "width mm", "height mm", "IoU finest", "IoU solvers"]
+    head = ["solver", "cell mm", "area mm²", "width mm", "height mm", "IoU finest", "IoU solvers"]
     head += ["volume error %", "CPU s"]
     body = [
         [
-            r["inlet"],
             r["solver"],
             f"{r['cell_mm']:g}",
             f"{r['area_mm2']:.1f} ± {r['area_sd_mm2']:.1f}",
@@ -160,8 +156,8 @@ def markdown(rows: list[Row]) -> str:
         f"A fan of 40 deg, {1e3 * HEIGHT_M:g} mm above a plane, {SPEED_MPS:g} m/s: flow / speed is "
         f"{rows[0]['ideal_mm2']:.1f} mm², the fan {fan_mm:.1f} mm wide. Area, width (where it is 0.5 mm "
         "thick) and height are means of 18 sections 1 mm apart; IoU is of the mean section in 1 mm pixels: "
-        "with the same solver on the finest grid of that inlet, and with the other solver on the same "
-        "grid.\n\n" + results.grid(head, body)
+        "with the same solver on the finest grid, and with the other solver on the same grid.\n\n"
+        + results.grid(head, body)
     )
 
 
@@ -187,7 +183,8 @@ def resumed(
             row = json.loads(line)
         except json.JSONDecodeError:
             continue  # the line a killed run was writing
-        done[json.dumps(row.pop("unit"), sort_keys=True)] = row
+        if row.get("error") is None:  # what failed is tried again
+            done[json.dumps(row.pop("unit"), sort_keys=True)] = row
     keys = {unit: json.dumps(asdict(unit), sort_keys=True) for unit in wanted}
     missing = [unit for unit in wanted if keys[unit] not in done]
     for unit in wanted:
@@ -217,17 +214,10 @@ def grid(options: argparse.Namespace) -> str:
     Returns:
         The table.
     """
-    cases = [
-        Case(inlet, solver, cell)
-        for inlet, cells in CELLS_MM.items()
-        for cell in cells
-        if cell >= options.finest
-        for solver in SOLVERS
-    ]
-    cases.sort(key=lambda c: -c.cell_mm)  # the cheap ones first
+    cases = [Case(solver, cell) for cell in CELLS_MM if cell >= options.finest for solver in SOLVERS]
     log = options.out / "laydown_grid.trials.jsonl"
     found = {c: row for c, row, _ in resumed(cases, lay, log, options.jobs, "grid")}
-    full = [found[c] for c in sorted(cases, key=lambda c: (c.inlet, c.solver, -c.cell_mm))]
+    full = [found[c] for c in sorted(cases, key=lambda c: (c.solver, -c.cell_mm))]
     rows = compared(full)
     text = markdown(rows)
     results.write(
@@ -248,6 +238,7 @@ def runs(options: argparse.Namespace) -> str:
     """
     wanted = laydown_data.plan(options.draws, options.seed, options.cell, options.solver)
     log = options.out / "laydown_runs.trials.jsonl"
+    laydown_data.check_settings(log, wanted[0])
     rows = []
     for run, row, new in resumed(wanted, laydown_data.simulate_run, log, options.jobs, "runs"):
         if new and row["error"] is None:
@@ -307,8 +298,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--cell", type=float, default=1.0, help="runs: cell [mm] (default: %(default)s)")
     parser.add_argument("--solver", default=SOLVERS[0], choices=SOLVERS, help="runs: (default: %(default)s)")
     options = command.checked(parser, arguments, jobs=1, seed=0, draws=1)
-    if not options.finest <= max(CELLS_MM["substrate"]):
-        parser.error(f"--finest {options.finest}: must be at most {max(CELLS_MM['substrate'])}")
+    if not options.finest <= max(CELLS_MM):
+        parser.error(f"--finest {options.finest}: must be at most {max(CELLS_MM)}")
     return options
 
 

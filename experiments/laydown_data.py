@@ -1,5 +1,6 @@
 """The surrogate's data: random tip paths, their simulated beads, one file for each centre path."""
 
+import json
 import tempfile
 import time
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 
 from agents.provenance import commit
 from experiments import results
-from seal_gym.core.errors import SealGymError, require
+from seal_gym.core.errors import ConfigError, SealGymError, require
 from seal_gym.core.frames import Array
 from seal_gym.sealant.laydown import paths, sections
 from seal_gym.sealant.laydown.config import GridCfg, LaydownCfg
@@ -138,6 +139,27 @@ def data(mesh: Any, fractions: Array, at: sections.Stations) -> dict[str, np.nda
     }
     image = np.round(255.0 * sections.cut(mesh, fractions, at.hits, at.tips)).astype(np.uint8)
     return {**{k: v.astype(np.float32) for k, v in single.items()}, "image": image}
+
+
+def check_settings(log: Path, run: Run) -> None:
+    """Refuses a folder with other runs: its files know draws by their numbers alone.
+
+    Args:
+        log: Of the folder's runs.
+        run: One that is wanted.
+
+    Raises:
+        ConfigError: If the log has a run with another seed, cell or solver.
+    """
+    wanted = {"seed": run.seed, "cell_mm": run.cell_mm, "solver": run.solver}
+    for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
+        try:
+            unit = json.loads(line)["unit"]
+        except (json.JSONDecodeError, KeyError):
+            continue  # the line a killed run was writing
+        found = {name: unit[name] for name in wanted}
+        if found != wanted:
+            raise ConfigError(f"{log.parent} holds runs with {found}, not {wanted}: use another --out")
 
 
 def store(path: Path, draw: int, arrays: dict[str, np.ndarray[Any, Any]]) -> None:

@@ -22,27 +22,24 @@ def grid(path: Path, rows: list[dict[str, Any]]) -> None:
         path: The PNG file.
         rows: Of the study, with their mean ``section``.
     """
-    inlets = [i for i in ("substrate", "top") if any(r["inlet"] == i for r in rows)]
     sizes = sorted({r["cell_mm"] for r in rows})
     colours = dict(zip(sizes, mpl.colormaps["viridis"](np.linspace(0.0, 0.85, len(sizes))), strict=True))
     x = (np.arange(COLUMNS) + 0.5 - COLUMNS / 2) * _MM
-    chosen = [r for r in rows if r["inlet"] == "substrate"]
-    lines = -(-len(chosen) // 4)
+    lines = -(-len(rows) // 4)
     figure = plt.figure(figsize=(13, 4.2 + 2.0 * lines), constrained_layout=True)
     halves: Any = figure.subfigures(2, 1, height_ratios=(4.2, 2.0 * lines))
     upper, lower = halves
-    for axes, inlet in zip(np.atleast_1d(upper.subplots(1, len(inlets), sharey=True)), inlets, strict=True):
-        for r in (r for r in rows if r["inlet"] == inlet):
-            thick = np.array(r["section"]).sum(0) * _MM
-            label = f"{r['solver']}, {r['cell_mm']:g} mm"
-            axes.plot(x, thick, _STYLE[r["solver"]], color=colours[r["cell_mm"]], label=label)
-        where = "substrate (default)" if inlet == "substrate" else "top of the mesh"
-        axes.set(title=f"jet let in through the {where}", xlabel="across [mm]", ylabel="thickness [mm]")
-        axes.grid(color="#dddddd", lw=0.6)
-        axes.legend(fontsize=8)
+    profile = upper.subplots()
+    for r in rows:
+        thick = np.array(r["section"]).sum(0) * _MM
+        label = f"{r['solver']}, {r['cell_mm']:g} mm"
+        profile.plot(x, thick, _STYLE[r["solver"]], color=colours[r["cell_mm"]], label=label)
+    profile.set(xlabel="across [mm]", ylabel="thickness [mm]")
+    profile.grid(color="#dddddd", lw=0.6)
+    profile.legend(fontsize=8)
     extent = (-COLUMNS / 2 * _MM, COLUMNS / 2 * _MM, -1e3 * BELOW_M, ROWS * _MM - 1e3 * BELOW_M)
     spots = lower.subplots(lines, 4, sharex=True, sharey=True, squeeze=False)
-    for axes, r in zip(spots.flat, chosen, strict=False):
+    for axes, r in zip(spots.flat, rows, strict=False):
         axes.imshow(np.array(r["section"]), origin="lower", extent=extent, cmap="Greys", vmin=0, vmax=1)
         axes.axhline(0.0, color="#d1382c", lw=0.8)
         axes.set(ylim=(-3, 6))
@@ -51,7 +48,7 @@ def grid(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.set_xlabel("across [mm]")
     for axes in spots[:, 0]:
         axes.set_ylabel("height [mm]")
-    for axes in spots.flat[len(chosen) :]:
+    for axes in spots.flat[len(rows) :]:
         axes.set_axis_off()
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -118,7 +118,7 @@ ABOUT = {
     "laydown_grid": (
         "Grid study of the reference simulation",
         "Grid study",
-        "One straight bead in OpenFOAM by cell size, solver and inlet.",
+        "One straight bead in OpenFOAM by cell size and solver.",
     ),
     "laydown_runs": (
         "Reference simulations of beads",

@@ -100,7 +100,7 @@ def test_all_of_a_naive_jet_lands_near_the_bead(name):
     edges = case.edges()
     path = naive_path(edges, case.duration_s, CFG, 201)
     cfg = simulation(substrate_of(case, edges), path, THETA, GridCfg(inlet_dt_s=1e-2))
-    _, _, place, _ = jet.landings(cfg)
+    _, _, place = jet.landings(cfg)
     points = np.concatenate((case.left, case.right))
     near = ((place > points.min(0) - 8e-3) & (place < points.max(0) + 8e-3)).all(axis=1)
     # A nozzle that swings over the top of the stairs throws a thousandth far over the last tread.

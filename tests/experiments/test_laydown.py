@@ -24,13 +24,13 @@ def fake_row(run, n=3):
     return row | {"cells": 5, "sections": n, "wall_s": 1.0, ARRAYS: arrays}
 
 
-def blank_row(inlet, solver, cell_mm, columns):
+def blank_row(solver, cell_mm, columns):
     section = np.zeros((20, 40))
     section[8:10, columns] = 1.0
     numbers = dict.fromkeys(
         ("area_mm2", "area_sd_mm2", "ideal_mm2", "width_mm", "height_mm", "volume_error_pct", "cpu_s"), 1.0
     )
-    head = {"inlet": inlet, "solver": solver, "cell_mm": cell_mm, "cells": 1, "lid_fraction": 0.0}
+    head = {"solver": solver, "cell_mm": cell_mm, "cells": 1, "lid_fraction": 0.0}
     return {**head, **numbers, "section": section.tolist()}
 
 
@@ -79,7 +79,9 @@ def test_data_are_kept_and_a_stopped_command_goes_on(tmp_path, without_openfoam)
     assert experiment.main([*arguments, "2"]) == 0
     assert [run.draw for run in without_openfoam[37:]] == [1] * 37
     assert experiment.main([*arguments, "2"]) == 0
-    assert len(without_openfoam) == 74
+    assert [(run.path, run.draw) for run in without_openfoam[74:]] == [
+        ("overhead", 1)
+    ]  # it failed: once more
     with np.load(tmp_path / "plane_s.npz", allow_pickle=False) as data:
         assert data["draw"].tolist() == [0, 0, 0, 1, 1, 1]
         assert data["image"].shape == (6, 20, 40)
@@ -90,6 +92,16 @@ def test_data_are_kept_and_a_stopped_command_goes_on(tmp_path, without_openfoam)
     assert (rows["overhead"]["runs"], rows["overhead"]["failed"], rows["overhead"]["sections"]) == (2, 1, 3)
     assert (rows["plane_s"]["failed"], rows["plane_s"]["sections"]) == (0, 6)
     assert [r["set"] for r in rows.values()].count("validation") == 12
+
+
+def test_a_folder_of_other_runs_is_refused(tmp_path, without_openfoam, capsys):
+    arguments = ["runs", "--out", str(tmp_path), "--draws", "1"]
+    assert experiment.main(arguments) == 0
+    before = (tmp_path / "plane_s.npz").read_bytes()
+    assert experiment.main([*arguments, "--seed", "1"]) == 2
+    assert experiment.main([*arguments, "--cell", "2"]) == 2
+    assert "use another --out" in capsys.readouterr().err
+    assert (tmp_path / "plane_s.npz").read_bytes() == before and len(without_openfoam) == 37
 
 
 def test_a_run_stored_twice_is_there_once(tmp_path):
@@ -119,32 +131,24 @@ def test_data_of_a_slab_by_hand():
 
 def test_beads_are_compared_with_the_finest_and_across_solvers():
     rows = [
-        blank_row("substrate", "interFoam", 1.0, slice(10, 20)),
-        blank_row("substrate", "interFoam", 0.5, slice(12, 22)),
-        blank_row("substrate", "interIsoFoam", 1.0, slice(10, 15)),
-        blank_row("top", "interFoam", 2.0, slice(0, 5)),
+        blank_row("interFoam", 1.0, slice(10, 20)),
+        blank_row("interFoam", 0.5, slice(12, 22)),
+        blank_row("interIsoFoam", 1.0, slice(10, 15)),
     ]
     found = experiment.compared(rows)
-    assert [r["iou_finest"] for r in found] == pytest.approx([8 / 12, 1.0, 1.0, 1.0])
-    assert [r["iou_solvers"] for r in found] == [pytest.approx(0.5), None, pytest.approx(0.5), None]
+    assert [r["iou_finest"] for r in found] == pytest.approx([8 / 12, 1.0, 1.0])
+    assert [r["iou_solvers"] for r in found] == [pytest.approx(0.5), None, pytest.approx(0.5)]
     assert all("section" not in r for r in found)
 
 
 def test_the_grid_study_writes_its_files(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment.foam, "find", lambda program: program)
     monkeypatch.setattr(
-        experiment, "lay", lambda c: blank_row(c.inlet, c.solver, c.cell_mm, slice(10, 20 + int(c.cell_mm)))
+        experiment, "lay", lambda c: blank_row(c.solver, c.cell_mm, slice(10, 20 + int(c.cell_mm)))
     )
     assert experiment.main(["grid", "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "laydown_grid.json").read_text())["rows"]
-    assert [(r["inlet"], r["cell_mm"]) for r in rows if r["solver"] == "interFoam"] == [
-        ("substrate", 2.0),
-        ("substrate", 1.0),
-        ("substrate", 0.75),
-        ("substrate", 0.5),
-        ("top", 2.0),
-        ("top", 1.0),
-    ]
+    assert [r["cell_mm"] for r in rows if r["solver"] == "interFoam"] == [2.0, 1.0, 0.75, 0.5]
     assert (tmp_path / "laydown_grid.png").stat().st_size > 10_000
     assert "IoU finest" in (tmp_path / "laydown_grid.md").read_text()
 

@@ -33,9 +33,6 @@ def build_mesh(cfg: LaydownCfg) -> Mesh:
     """
     part, grid = cfg.part, cfg.grid
     place = jet.landings(cfg)[2][:, :2]
-    if grid.inlet == "top":
-        lid = jet.landings(cfg, lambda x, y: part.height(x, y) + grid.clearance_m)[2]
-        place = np.vstack((place, lid[:, :2]))
     landings, margin = cKDTree(place), grid.margin_m
 
     def near(x: Array, y: Array) -> NDArray[np.bool_]:
@@ -208,28 +205,26 @@ def _write_mesh(mesh: Mesh, folder: Path) -> None:
     )
 
 
-def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path, *, fractions: bool) -> None:
+def _write_inflow(flow: jet.Inflow, centres: Array, folder: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "points").write_text(foam.values(centres))
-    wet = flow.flows_m3s > 0
-    wet = (
-        wet | np.roll(wet, 1, 0) | np.roll(wet, -1, 0)
-    )  # nothing flows at either end, so nothing wraps around
-    for time, velocity, full in zip(flow.times_s, flow.velocities, wet, strict=True):
+    for time, velocity in zip(flow.times_s, flow.velocities, strict=True):
         at = folder / f"{time:.9g}"
         at.mkdir()
         (at / "U").write_text(foam.values(velocity))
-        if fractions:
-            (at / f"alpha.{FLUID}").write_text(foam.values(full.astype(float)))
 
 
-def _boundaries(inlet: str) -> dict[str, tuple[str, str, dict[str, Entry]]]:
+def _boundaries() -> dict[str, tuple[str, str, dict[str, Entry]]]:
     """Dimensions, initial value and boundary conditions of each field."""
     free: Entry = {"type": "pressureInletOutletVelocity", "value": "uniform (0 0 0)"}
     air: Entry = {"type": "totalPressure", "p0": "uniform 0", "value": "uniform 0"}
     given: Entry = {"type": "fixedFluxPressure", "value": "uniform 0"}
-    mapped = {"type": "timeVaryingMappedFixedValue", "mapMethod": "nearest", "setAverage": "off"}
-    jets: Entry = mapped | {"value": "uniform (0 0 0)"}
+    jets: Entry = {
+        "type": "timeVaryingMappedFixedValue",
+        "mapMethod": "nearest",
+        "setAverage": "off",
+        "value": "uniform (0 0 0)",
+    }
     alpha = f"alpha.{FLUID}"
     velocity: dict[str, Entry] = {"top": free, "sides": free, "substrate": jets}
     # To the fluid the wall is full of sealant: what comes out of it is, and what lies on it sticks to it.
@@ -239,10 +234,6 @@ def _boundaries(inlet: str) -> dict[str, tuple[str, str, dict[str, Entry]]]:
         "substrate": {"type": "fixedValue", "value": "uniform 1"},
     }
     pressure: dict[str, Entry] = {"top": air, "sides": air, "substrate": given}
-    if inlet == "top":
-        velocity |= {"top": jets, "substrate": {"type": "noSlip"}}
-        fraction |= {"top": mapped | {"value": "uniform 0"}, "substrate": {"type": "zeroGradient"}}
-        pressure |= {"top": given}
     return {
         "U": ("[0 1 -1 0 0 0 0]", "(0 0 0)", velocity),
         alpha: ("[0 0 0 0 0 0 0]", "0", fraction),
@@ -267,9 +258,8 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
     flow = jet.inflow(cfg, mesh)
     end_s = round(float(flow.times_s[-1]) + cfg.grid.settle_s, 9)
     _write_mesh(mesh, folder / "constant" / "polyMesh")
-    inlet = cfg.grid.inlet
-    data = folder / "constant" / "boundaryData" / inlet
-    _write_inflow(flow, mesh.faces_of(inlet)[0], data, fractions=inlet == "top")
+    data = folder / "constant" / "boundaryData" / "substrate"
+    _write_inflow(flow, mesh.faces_of("substrate")[0], data)
     gravity: dict[str, Entry] = {
         "dimensions": "[0 1 -2 0 0 0 0]",
         "value": "({:.9g} {:.9g} {:.9g})".format(*cfg.gravity_mps2),
@@ -287,6 +277,6 @@ def write(cfg: LaydownCfg, folder: Path) -> tuple[Mesh, jet.Inflow, float]:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(header(cls, file.name) + dictionary(entries))
     (folder / "0").mkdir()
-    for name, (dimensions, value, patches) in _boundaries(inlet).items():
+    for name, (dimensions, value, patches) in _boundaries().items():
         (folder / "0" / name).write_text(_field(name, dimensions, value, patches))
     return mesh, flow, end_s

@@ -86,18 +86,15 @@ class GridCfg:
     Attributes:
         cell_m: Edge of a cell [m].
         clearance_m: Height of the mesh above the highest part of the substrate [m].
-        inlet: Where the jet comes in: ``"substrate"``: through the faces that it lands on, without momentum;
-            ``"top"``: through the mesh's top, in strips that it fills, slowed down as their thickness asks.
         margin_m: Mesh around the area that the jet meets [m].
         solver: ``"interFoam"`` (interface compression) or ``"interIsoFoam"`` (geometric interface).
         courant: Largest Courant number.
-        inlet_dt_s: Spacing of the jet's samples on the mesh's top [s].
+        inlet_dt_s: Spacing of the jet's samples [s].
         settle_s: Time simulated after the last fluid came in [s].
     """
 
     cell_m: float = 1e-3
     clearance_m: float = 6e-3
-    inlet: Literal["substrate", "top"] = "substrate"
     margin_m: float = 6e-3
     solver: Literal["interFoam", "interIsoFoam"] = "interFoam"
     courant: float = 0.5
@@ -108,7 +105,6 @@ class GridCfg:
         _in_range("cell_m", self.cell_m, 1e-4, 5e-3, "m")
         _in_range("clearance_m", self.clearance_m, 2e-3, 5e-2, "m")
         _in_range("margin_m", self.margin_m, 1e-3, 5e-2, "m")
-        require(self.inlet in ("substrate", "top"), f"inlet = {self.inlet!r}: must be 'substrate' or 'top'")
         require(self.solver in SOLVERS, f"solver = {self.solver!r}: must be one of {', '.join(SOLVERS)}")
         _in_range("courant", self.courant, 0.05, 2.0, "")
         _in_range("inlet_dt_s", self.inlet_dt_s, 1e-5, 1e-2, "s")
@@ -146,7 +142,8 @@ class TcpPath:
         require(bool((self.flows_m3s >= 0).all()), "flows_m3s: must not be negative")
         identity = self.rotations @ np.swapaxes(self.rotations, -1, -2)
         require(
-            bool(np.allclose(identity, np.eye(3), atol=1e-6)), "rotations: must be orthonormal (R R^T = 1)"
+            bool(np.allclose(identity, np.eye(3), atol=1e-6) and (np.linalg.det(self.rotations) > 0).all()),
+            "rotations: must be rotations (R R^T = 1, determinant 1)",
         )
 
     def at(self, times_s: Array) -> tuple[Array, Array, Array]:

@@ -5,10 +5,9 @@ inflow's integral over time is the nozzle's to rounding; a jet that the tip stre
 arrives stretched or compressed.
 
 A fan's sheet is some 0.2 mm thick where it lands, far thinner than an affordable cell: let in through the top
-of the mesh it has to be made thicker and slower, and then hangs together, tears or drags air along. The real
-one loses its momentum within about its own thickness (Reynolds number of the impact about 2). By default its
-fluid is therefore given to the substrate's faces where it comes down, without momentum, and pushes up what is
-there.
+of the mesh it has to be made thicker and slower, and then sticks to the lid and never comes down. The real
+one loses its momentum within about its own thickness (Reynolds number of the impact about 2). Its fluid is
+therefore given to the substrate's faces where it comes down, without momentum, and pushes up what is there.
 """
 
 import math
@@ -135,29 +134,25 @@ def _reach_s(cfg: LaydownCfg) -> float:
     return 3.0 * height / cfg.nozzle.jet_speed_mps
 
 
-def landings(cfg: LaydownCfg, surface: Height | None = None) -> tuple[Parcels, Array, Array, Array]:
+def landings(cfg: LaydownCfg) -> tuple[Parcels, Array, Array]:
     """Where the jet comes down.
 
     Args:
         cfg: The simulation.
-        surface: z [m] of (x, y) [m]; the bare substrate by default.
 
     Returns:
-        The parcels, their times of arrival (n,) [s], places (n, 3) [m] and velocities there (n, 3) [m/s].
+        The parcels, their times of arrival (n,) [s] and places (n, 3) [m].
 
     Raises:
-        LaydownError: If a part of the jet misses the surface.
+        LaydownError: If a part of the jet misses the substrate.
     """
-    jet, surface = emit(cfg), surface or cfg.part.height
+    jet = emit(cfg)
     gravity = np.asarray(cfg.gravity_mps2)
-    t, place, velocity = fly(jet.positions, jet.velocities, gravity, surface, reach_s=_reach_s(cfg))
+    t, place, _ = fly(jet.positions, jet.velocities, gravity, cfg.part.height, reach_s=_reach_s(cfg))
     if np.isnan(t).any():
         part = f"{np.isnan(t).mean():.1%} of the jet"
-        raise LaydownError(
-            f"{part} does not come down on the substrate: tilt or drag less"
-            + (", or keep the tip above the mesh (grid.clearance_m)" if cfg.grid.inlet == "top" else "")
-        )
-    return jet, jet.times_s + t, place, velocity
+        raise LaydownError(f"{part} does not come down on the substrate: tilt or drag less")
+    return jet, jet.times_s + t, place
 
 
 @dataclass(frozen=True)
@@ -191,30 +186,25 @@ def inflow(cfg: LaydownCfg, mesh: Mesh) -> Inflow:
         mesh: Its mesh.
 
     Returns:
-        Samples from 0 to after the last parcel; their volume is the path's to rounding. Through the substrate
-        they run along its normal, through the top along the jet.
+        Samples from 0 to after the last parcel, along the substrate's normal; their volume is the path's to
+        rounding.
 
     Raises:
-        LaydownError: If a part of the jet misses the substrate or the mesh's top.
+        LaydownError: If a part of the jet misses the substrate.
     """
-    top = cfg.grid.inlet == "top"
-    jet, arrival, place, velocity = landings(cfg, mesh.top if top else None)
-    centres, areas = mesh.faces_of(cfg.grid.inlet)
+    jet, arrival, place = landings(cfg)
+    centres, areas = mesh.faces_of("substrate")
     dt, faces = cfg.grid.inlet_dt_s, cKDTree(centres)
     index, part = np.divmod(arrival / dt + 1.0, 1.0)
     shape = int(index.max()) + 3, faces.n
     size = shape[0] * shape[1]
-    flows, momentum = np.zeros(size), np.zeros((3, size))
+    flows = np.zeros(size)
     for layer in (np.arange(_LAYERS) + 0.5) / _LAYERS - 0.5:
         _, face = faces.query(place + layer * cfg.nozzle.strip_m * jet.across)
         for sample, weight in ((index, 1.0 - part), (index + 1, part)):
             at = sample.astype(int) * faces.n + face
             amount = jet.volumes_m3 / _LAYERS * weight / dt
             flows += np.bincount(at, weights=amount, minlength=size)
-            if top:
-                momentum += [np.bincount(at, weights=amount * v, minlength=size) for v in velocity.T]
     flow = flows.reshape(shape)
-    along = momentum.T.reshape(*shape, 3) if top else np.broadcast_to(-areas, (*shape, 3))
-    inward = -(along * areas).sum(-1)
-    speed = np.divide(flow, inward, out=np.zeros(shape), where=flow > 0)  # so that velocity . area = -flow
-    return Inflow(np.arange(shape[0], dtype=float) * dt, flow, along * speed[:, :, None])
+    per_area = flow / (areas**2).sum(-1)  # so that velocity . area = -flow
+    return Inflow(np.arange(shape[0], dtype=float) * dt, flow, -areas * per_area[:, :, None])

@@ -72,18 +72,6 @@ class Mesh:
         first, count = self.patches["top"]
         return np.asarray(self.owner[first : first + count])
 
-    def top(self, x: Array, y: Array) -> Array:
-        """The lid before it is made of steps.
-
-        Args:
-            x: Shape (...) [m].
-            y: Shape (...) [m].
-
-        Returns:
-            z, shape (...) [m].
-        """
-        return np.asarray(self.lid_m + self.substrate.smooth(x, y))
-
     def cells_at(self, points: Array) -> Indices:
         """Which cells hold some points.
 

@@ -51,7 +51,7 @@ def expected_peak_m(cfg: LaydownCfg) -> float:
     Returns:
         The largest mean height over 3 x 3 mm [m].
     """
-    jets, _, place, _ = jet.landings(cfg)
+    jets, _, place = jet.landings(cfg)
     cell = 1e-3
     low = np.floor(place[:, :2].min(0) / cell) - 3
     i, j = (np.floor(place[:, :2] / cell) - low).astype(int).T

@@ -111,7 +111,7 @@ def test_it_agrees_with_the_flown_jet_of_a_simulation():
     cfg = LaydownCfg(path=tip_path(TRAINING[0], draws), gravity_mps2=(0.0, 0.0, 0.0))
     at = sections.stations(cfg)
     n = len(at.arcs_m) // 2
-    jet, _, place, _ = landings(cfg)
+    jet, _, place = landings(cfg)
     local = (place - at.hits[n]) @ at.tips[n]
     slab = 2e-3
     near = np.abs(local[:, 1]) < slab / 2

@@ -118,7 +118,7 @@ def test_a_part_of_ones_own_is_laid_on():
     pit = Substrate(carved=lambda x, y: -0.5 + 0.0 * x)
     cfg = LaydownCfg(path=straight().path, substrate=pit)
     assert cfg.part is pit
-    _, _, place, _ = jet.landings(cfg)
+    _, _, place = jet.landings(cfg)
     np.testing.assert_allclose(place[:, 2], -0.5, atol=1e-6)
     with pytest.raises(SealGymError, match="must be a Substrate or one of"):
         LaydownCfg(path=straight().path, substrate="pit")
