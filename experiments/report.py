@@ -115,6 +115,21 @@ ABOUT = {
         "Observers",
         "The two-layer Hopfield observer beside thresholds and k-NN in changing light and noise.",
     ),
+    "bead_reference": (
+        "Bead paths in the reference simulation",
+        "Reference beads",
+        "The eight cases' naive and optimal paths laid by OpenFOAM.",
+    ),
+    "bead_refine": (
+        "Bead paths refined",
+        "Refined paths",
+        "Optimal paths refined on an evaluator of the bead, and what that gains in the reference.",
+    ),
+    "surrogate": (
+        "A surrogate of bead cross-sections",
+        "Surrogate",
+        "Networks, a linear glass box and a fast tier on beads around paths that none has seen.",
+    ),
     "laydown_grid": (
         "Grid study of the reference simulation",
         "Grid study",
