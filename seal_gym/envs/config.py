@@ -48,8 +48,31 @@ def _one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
     require(value in allowed, f"{name} = {value!r}: must be one of {list(allowed)}")
 
 
+class KeywordCfg:
+    """The keyword arguments of an environment, for a dataclass of them."""
+
+    @classmethod
+    def of(cls, **kwargs: Any) -> Self:
+        """Builds the configuration from an environment's keyword arguments.
+
+        Args:
+            **kwargs: The attributes above.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: If a name is unknown or a value out of range.
+        """
+        names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # a dataclass
+        unknown = sorted(set(kwargs) - set(names))
+        if unknown:
+            raise ConfigError(f"unknown keyword argument {unknown}: the environment takes {names}")
+        return cls(**kwargs)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SealCfg:
+class SealCfg(KeywordCfg):
     """How a sealing environment is put together.
 
     Attributes:
@@ -138,22 +161,3 @@ class SealCfg:
         )
         object.__setattr__(self, "disturbances", disturbances(self.disturbances))
         object.__setattr__(self, "leaves", tuple(self.leaves))
-
-    @classmethod
-    def of(cls, **kwargs: Any) -> Self:
-        """Builds the configuration from an environment's keyword arguments.
-
-        Args:
-            **kwargs: The attributes above.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            ConfigError: If a name is unknown or a value out of range.
-        """
-        names = [f.name for f in fields(cls)]
-        unknown = sorted(set(kwargs) - set(names))
-        if unknown:
-            raise ConfigError(f"unknown keyword argument {unknown}: the environment takes {names}")
-        return cls(**kwargs)

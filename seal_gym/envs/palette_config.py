@@ -1,12 +1,12 @@
 """The keyword arguments of the palette environment."""
 
-from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from seal_gym.core.cell import CellCfg, OverheadCfg, load_cell
-from seal_gym.core.errors import ConfigError, is_number, require
+from seal_gym.core.errors import is_number, require
+from seal_gym.envs.config import KeywordCfg
 from seal_gym.sim.look import LookCfg
 from seal_gym.sim.palette_scene import BOARD_TOP_M
 from seal_gym.sim.rgbd import DepthNoiseCfg
@@ -80,7 +80,7 @@ def _observer() -> TieObserver:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PaletteCfg:
+class PaletteCfg(KeywordCfg):
     """How the palette environment is put together.
 
     Attributes:
@@ -137,22 +137,3 @@ class PaletteCfg:
             callable(self.observer),
             f"observer = {self.observer!r}: must be a function of a picture, its depth and the camera",
         )
-
-    @classmethod
-    def of(cls, **kwargs: Any) -> Self:
-        """Builds the configuration from the environment's keyword arguments.
-
-        Args:
-            **kwargs: The attributes above.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            ConfigError: If a name is unknown or a value out of range.
-        """
-        names = [f.name for f in fields(cls)]
-        unknown = sorted(set(kwargs) - set(names))
-        if unknown:
-            raise ConfigError(f"unknown keyword argument {unknown}: the environment takes {names}")
-        return cls(**kwargs)
