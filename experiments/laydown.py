@@ -71,7 +71,7 @@ def bead(case: Case) -> LaydownCfg:
         rotations=np.repeat(np.eye(3)[None], 2, 0),
         flows_m3s=np.full(2, THESIS_FLOW_M3S),
     )
-    grid = GridCfg(cell_m=1e-3 * case.cell_mm, solver=case.solver)  # type: ignore[arg-type]
+    grid = GridCfg(cell_m=1e-3 * case.cell_mm, solver=case.solver)
     return LaydownCfg(path=path, grid=grid)
 
 

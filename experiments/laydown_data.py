@@ -76,7 +76,7 @@ def simulation(run: Run) -> LaydownCfg:
             path=paths.random_tip_path(centre, rng),
             substrate=centre.substrate,
             gravity_mps2=centre.gravity_mps2,
-            grid=GridCfg(cell_m=1e-3 * run.cell_mm, solver=run.solver),  # type: ignore[arg-type]
+            grid=GridCfg(cell_m=1e-3 * run.cell_mm, solver=run.solver),
         )
     )
 
@@ -177,7 +177,7 @@ def store(path: Path, draw: int, arrays: dict[str, np.ndarray[Any, Any]]) -> Non
             new = {k: np.concatenate((old[k][kept], v)) for k, v in new.items()}
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        np.savez_compressed(file, **new)  # type: ignore[arg-type]
+        np.savez_compressed(file, **new)  # type: ignore[arg-type]  # numpy types **kwds with its own flag
     part.replace(path)
 
 

@@ -24,7 +24,7 @@ class LaydownError(SealGymError, RuntimeError):
 
 
 def _in_range(name: str, value: object, low: float, high: float, unit: str) -> None:
-    ok = is_number(value) and low <= float(value) <= high  # type: ignore[arg-type]
+    ok = is_number(value) and low <= float(value) <= high  # type: ignore[arg-type]  # is_number is no type guard
     require(ok, f"{name} = {value!r}: must be a number in [{low:g}, {high:g}] {unit}")
 
 
@@ -96,7 +96,7 @@ class GridCfg:
     cell_m: float = 1e-3
     clearance_m: float = 6e-3
     margin_m: float = 6e-3
-    solver: Literal["interFoam", "interIsoFoam"] = "interFoam"
+    solver: str = "interFoam"
     courant: float = 0.5
     inlet_dt_s: float = 1e-3
     settle_s: float = 0.03

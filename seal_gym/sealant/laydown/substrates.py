@@ -113,4 +113,3 @@ SUBSTRATES: dict[str, Substrate] = {
     "pocket": Substrate(carved=_pocket),
     "joggle": Substrate(smooth=lambda x, y: 1.5e-3 * (1.0 + np.tanh(x / 3e-3)) + 0.0 * y),
 }
-VALIDATION_SUBSTRATES = ("stairs", "ramp", "vee", "wave", "dome", "box", "pocket", "joggle")
